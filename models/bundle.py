@@ -1,0 +1,190 @@
+"""The bundle: a folder of ``manifest.json``, ``*.onnx`` graphs and ``MODEL_CARD.md``.
+
+Errors
+    BundleError                 anything wrong with a bundle on disk
+    ├── ManifestError           the manifest is missing, unreadable or of another format
+    └── CorruptBundleError      a graph is missing or is not the file that was exported
+"""
+
+import hashlib
+import json
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from models.diffusion import Schedule
+from models.motion.skeleton import Skeleton
+
+FORMAT_VERSION = 1
+MANIFEST_FILE = "manifest.json"
+CARD_FILE = "MODEL_CARD.md"
+
+
+class BundleError(Exception):
+    """A bundle cannot be used."""
+
+
+class ManifestError(BundleError):
+    """The manifest is missing, unreadable or of another format."""
+
+
+class CorruptBundleError(BundleError):
+    """A file of the bundle is missing or differs from the one exported."""
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class TensorSpec(_Record):
+    """Name and shape of a graph's input or output; "B" stands for the batch."""
+
+    name: str
+    shape: tuple[int | str, ...]
+    dtype: Literal["float32", "int64"] = "float32"
+
+
+class GraphSpec(_Record):
+    """One ONNX file of the bundle and the tensors it takes and gives."""
+
+    file: str = Field(pattern=r"^[A-Za-z0-9_-]+\.onnx$")
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    inputs: tuple[TensorSpec, ...]
+    outputs: tuple[TensorSpec, ...]
+
+
+class SkeletonSpec(_Record):
+    """The skeleton that the graphs speak."""
+
+    name: str
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+
+    def skeleton(self) -> Skeleton:
+        """The same skeleton as the motion room's type."""
+        return Skeleton(name=self.name, joints=self.joints, parents=self.parents)
+
+
+class ScheduleSpec(_Record):
+    """Tables of the diffusion process, and how many of its steps run by default."""
+
+    alpha_bar: tuple[float, ...] = Field(min_length=1)
+    variance: tuple[tuple[float, ...], ...]
+    eta: float = Field(default=0.0, ge=0.0, le=1.0)
+
+    def schedule(self) -> Schedule:
+        """The tables as arrays."""
+        return Schedule(alpha_bar=np.array(self.alpha_bar), variance=np.array(self.variance))
+
+
+class Manifest(_Record):
+    """Everything that the generic server must know of a bundle."""
+
+    format_version: Literal[1] = FORMAT_VERSION
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$")
+    version: str
+    system: str
+    description: str
+    licence: str
+    attribution: tuple[str, ...] = ()
+    skeleton: SkeletonSpec
+    fps: float = Field(gt=0)
+    num_observed: int = Field(gt=0)
+    horizon: int = Field(gt=0)
+    trajectory: Literal["world", "root-relative"] = "world"
+    symmetries: tuple[Literal["yaw", "translation"], ...] = ()
+    schedule: ScheduleSpec | None = None
+    x_t_shape: tuple[int, ...] = ()
+    encoder: GraphSpec | None = None
+    denoiser: GraphSpec | None = None
+    decoder: GraphSpec
+    recipe: dict[str, Any] = Field(default_factory=dict)
+    training: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _denoiser_has_a_schedule(self) -> "Manifest":
+        if (self.denoiser is None) != (self.schedule is None):
+            raise ValueError("schedule: a bundle has a denoiser and a schedule, or neither.")
+        return self
+
+    def graphs(self) -> dict[str, GraphSpec]:
+        """The graphs that this bundle has, by role, in the order in which they run."""
+        roles = {"encoder": self.encoder, "denoiser": self.denoiser, "decoder": self.decoder}
+        return {role: graph for role, graph in roles.items() if graph is not None}
+
+    @property
+    def num_steps(self) -> int:
+        """K, the denoising steps of the whole chain; 1 for a bundle without a denoiser."""
+        return len(self.schedule.alpha_bar) if self.schedule else 1
+
+    @property
+    def digest(self) -> str:
+        """Short sha256 over the graphs and the tables: two bundles that answer alike share it."""
+        body = self.model_dump(mode="json", exclude={"recipe", "training", "description"})
+        return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def sha256_of(path: Path) -> str:
+    """Hexadecimal sha256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of the bundle in a folder, its graphs verified against their sha256.
+
+    Raises:
+        ManifestError: manifest.json is missing, not JSON, or of another format.
+        CorruptBundleError: a graph is missing or differs from the one exported.
+    """
+    path = folder / MANIFEST_FILE
+    if not path.is_file():
+        raise ManifestError(f"{folder.name}: found no {MANIFEST_FILE}; every bundle needs one.")
+    try:
+        manifest = Manifest.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise ManifestError(
+            f"{folder.name}/{MANIFEST_FILE}: {field}: {first['msg']}; "
+            f"it must follow bundle format {FORMAT_VERSION}."
+        ) from error
+    for graph in manifest.graphs().values():
+        _verify(folder / graph.file, graph.sha256)
+    return manifest
+
+
+def _verify(path: Path, expected: str) -> None:
+    if not path.is_file():
+        raise CorruptBundleError(f"{path.parent.name}/{path.name}: the file is missing.")
+    found = sha256_of(path)
+    if found != expected:
+        raise CorruptBundleError(
+            f"{path.parent.name}/{path.name}: found sha256 {found[:12]}…, the manifest says "
+            f"{expected[:12]}…; copy or export the bundle again."
+        )
+
+
+def write_bundle(folder: Path, manifest: Manifest, files: dict[str, bytes]) -> None:
+    """Write manifest, graphs and model card together: the whole bundle appears, or nothing does.
+
+    An older bundle in the folder is replaced. ``files`` holds every other file by name.
+
+    Raises:
+        CorruptBundleError: a graph's bytes are missing or do not have the manifest's sha256.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".writing-") as scratch:
+        new = Path(scratch) / folder.name
+        new.mkdir()
+        for name, content in files.items():
+            (new / name).write_bytes(content)
+        for graph in manifest.graphs().values():
+            _verify(new / graph.file, graph.sha256)
+        (new / MANIFEST_FILE).write_text(manifest.model_dump_json(indent=1) + "\n")
+        if folder.exists():
+            shutil.move(folder, Path(scratch) / "old")
+        new.rename(folder)

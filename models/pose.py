@@ -1,0 +1,140 @@
+"""The canonical frame and the spectral form of motion, in torch."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from models.motion.skeleton import Skeleton
+
+
+def facing(skeleton: Skeleton) -> tuple[tuple[int, int], ...]:
+    """Pairs (left, right) of joints whose connecting line tells where a body faces."""
+    mirror = skeleton.mirror
+    pairs = [(j, mirror[j]) for j, side in enumerate(skeleton.sides) if side == "left"]
+    hips = [pair for pair in pairs if skeleton.parents[pair[0]] == 0]
+    return tuple(hips or pairs)
+
+
+class Frame:
+    """The canonical frame: last observed root at the origin, last observed facing along +X.
+
+    Args:
+        observation: poses in the world, metres, root first.
+        pairs: the joints that define the facing, from `facing`.
+    """
+
+    def __init__(
+        self, observation: Float[Tensor, "B T J 3"], pairs: tuple[tuple[int, int], ...]
+    ) -> None:
+        last = observation[:, -1]
+        left = last[:, [pair[0] for pair in pairs]].mean(dim=1)
+        right = last[:, [pair[1] for pair in pairs]].mean(dim=1)
+        across = left - right
+        length = across[:, :2].square().sum(dim=-1, keepdim=True).add(1e-12).sqrt()
+        unit = across[:, :2] / length  # a person who faces +X has the left side at +Y
+        self.origin = last[:, :1].unsqueeze(1)  # (B, 1, 1, 3)
+        self.cos = unit[:, 1].reshape(-1, 1, 1)
+        self.sin = -unit[:, 0].reshape(-1, 1, 1)
+
+    def enter(self, world: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
+        """Poses of the world in the canonical frame."""
+        x, y, z = (world - self.origin).unbind(dim=-1)
+        return torch.stack(
+            [self.cos * x + self.sin * y, self.cos * y - self.sin * x, z], dim=-1
+        )
+
+    def leave(self, canonical: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
+        """Poses of the canonical frame in the world."""
+        x, y, z = canonical.unbind(dim=-1)
+        turned = torch.stack(
+            [self.cos * x - self.sin * y, self.cos * y + self.sin * x, z], dim=-1
+        )
+        return turned + self.origin
+
+
+def relative_to_root(poses: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
+    """Joints relative to the root of their frame; the root's own row keeps its path."""
+    return torch.cat([poses[:, :, :1], poses[:, :, 1:] - poses[:, :, :1]], dim=2)
+
+
+def with_root(relative: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
+    """Inverse of `relative_to_root`."""
+    return torch.cat([relative[:, :, :1], relative[:, :, 1:] + relative[:, :, :1]], dim=2)
+
+
+def continuation_basis(num_bases: int, length: int) -> Float[Tensor, "length num_bases"]:
+    """Orthonormal sines over the frames 1 … length that are 0 at frame 0, the last observed one.
+
+    The discrete sine transform whose right end is free: a motion written in it starts where the
+    observation ends, whatever its coefficients.
+    """
+    frame = torch.arange(1, length + 1, dtype=torch.float64)[:, None]
+    order = torch.arange(num_bases, dtype=torch.float64)[None] + 0.5
+    basis = torch.sin(math.pi * order * frame / (length + 0.5))
+    return (basis * math.sqrt(2 / (length + 0.5))).float()
+
+
+def cosine_basis(num_bases: int, length: int) -> Float[Tensor, "length num_bases"]:
+    """Orthonormal discrete cosine transform, type 2, of the first num_bases frequencies."""
+    frame = torch.arange(length, dtype=torch.float64)[:, None] + 0.5
+    order = torch.arange(num_bases, dtype=torch.float64)[None]
+    basis = torch.cos(math.pi * order * frame / length) * math.sqrt(2 / length)
+    basis[:, 0] /= math.sqrt(2)
+    return basis.float()
+
+
+class WorldPoses:
+    """Features of poses in the canonical frame, the root's path included.
+
+    Joints are relative to their frame's root, so that the features of a walk repeat; the root's
+    path counts root_weight times, because an error of the root moves every joint of the body.
+    """
+
+    def __init__(self, skeleton: Skeleton, *, root_weight: float) -> None:
+        self.num_features = 3 * skeleton.num_joints
+        self._pairs = facing(skeleton)
+        self._root_weight = root_weight
+
+    def enter(
+        self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B L J 3"]
+    ) -> Float[Tensor, "B L F"]:
+        """Features of poses of the observation's world."""
+        relative = relative_to_root(Frame(observation, self._pairs).enter(poses))
+        root, joints = relative[:, :, :1] * self._root_weight, relative[:, :, 1:]
+        return torch.cat([root, joints], dim=2).flatten(2)
+
+    def leave(
+        self, observation: Float[Tensor, "B T J 3"], features: Float[Tensor, "B L F"]
+    ) -> Float[Tensor, "B L J 3"]:
+        """Poses in the observation's world."""
+        joints = features.unflatten(2, (-1, 3))
+        root = joints[:, :, :1] / self._root_weight
+        canonical = with_root(torch.cat([root, joints[:, :, 1:]], dim=2))
+        return Frame(observation, self._pairs).leave(canonical)
+
+
+class RootRelativePoses:
+    """Features of the field's benchmarks: joints relative to the root, the root itself dropped.
+
+    Answers keep the root where it was last seen.
+    """
+
+    def __init__(self, skeleton: Skeleton) -> None:
+        self.num_features = 3 * (skeleton.num_joints - 1)
+
+    def enter(
+        self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B L J 3"]
+    ) -> Float[Tensor, "B L F"]:
+        """Features of poses; the observation has no part in them."""
+        del observation
+        return (poses[:, :, 1:] - poses[:, :, :1]).flatten(2)
+
+    def leave(
+        self, observation: Float[Tensor, "B T J 3"], features: Float[Tensor, "B L F"]
+    ) -> Float[Tensor, "B L J 3"]:
+        """Poses around the last observed root."""
+        joints = features.unflatten(2, (-1, 3))
+        root = observation[:, -1:, :1].expand(-1, joints.shape[1], -1, -1)
+        return torch.cat([root, joints + root], dim=2)

@@ -1,0 +1,159 @@
+"""Everything that can go wrong in the service, as one tree; HTTP shows it as problem+json.
+
+ServiceError                       status  problem
+├── InputError                             the caller's fault
+│   ├── MalformedBodyError         400     malformed-body
+│   ├── NotFoundError              404     not-found
+│   ├── MethodError                405     method-not-allowed
+│   ├── BodyTooLargeError          413     body-too-large
+│   ├── MediaTypeError             415     unsupported-media-type
+│   └── FieldError                 422     invalid-field
+│       ├── PosesError             422     invalid-poses
+│       ├── TooFewFramesError      422     too-few-frames
+│       ├── UnknownSkeletonError   422     unknown-skeleton
+│       └── UnknownModelError      422     unknown-model (404 in a path)
+├── UnavailableError               503     unavailable: loading, stopping or refused bundle
+└── EngineError                    500     prediction-failed
+    ├── GraphError                 500     a graph could not run
+    └── NonFiniteError             500     a graph gave NaN or infinity
+"""
+
+from typing import ClassVar
+
+
+class ServiceError(Exception):
+    """Something that a caller is told: where, what was found, what would be right."""
+
+    status: ClassVar[int] = 500
+    slug: ClassVar[str] = "internal"
+    title: ClassVar[str] = "The server failed"
+
+    def __init__(
+        self, detail: str, *, pointer: str | None = None, found: str = "", expected: str = ""
+    ) -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.pointer = pointer
+        self.found = found
+        self.expected = expected
+
+
+class InputError(ServiceError):
+    """The request cannot be answered as it was sent."""
+
+    status = 400
+    slug = "bad-request"
+    title = "The request is not valid"
+
+
+class MalformedBodyError(InputError):
+    """The body is not a JSON object."""
+
+    slug = "malformed-body"
+    title = "The body is not a JSON object"
+
+
+class NotFoundError(InputError):
+    """Nothing lives at this path."""
+
+    status = 404
+    slug = "not-found"
+    title = "There is nothing at this path"
+
+
+class MethodError(InputError):
+    """The path does not take this method."""
+
+    status = 405
+    slug = "method-not-allowed"
+    title = "The path does not take this method"
+
+
+class BodyTooLargeError(InputError):
+    """The body has more bytes than the server takes."""
+
+    status = 413
+    slug = "body-too-large"
+    title = "The body is too large"
+
+
+class MediaTypeError(InputError):
+    """The body is declared as something other than JSON."""
+
+    status = 415
+    slug = "unsupported-media-type"
+    title = "The body's media type is not supported"
+
+
+class FieldError(InputError):
+    """A field is missing, unknown, of the wrong type or out of range."""
+
+    status = 422
+    slug = "invalid-field"
+    title = "A field is not valid"
+
+    def __init__(self, *, pointer: str, found: str, expected: str) -> None:
+        super().__init__(
+            f"{_where(pointer)}: found {found}; {expected}.",
+            pointer=pointer,
+            found=found,
+            expected=expected,
+        )
+
+
+class PosesError(FieldError):
+    """The poses have a wrong shape or a coordinate that no body has."""
+
+    slug = "invalid-poses"
+    title = "The poses are not valid"
+
+
+class TooFewFramesError(FieldError):
+    """The observation is shorter than the model needs."""
+
+    slug = "too-few-frames"
+    title = "The observation is too short"
+
+
+class UnknownSkeletonError(FieldError):
+    """No standard skeleton has this name, or own names do not say enough about the body."""
+
+    slug = "unknown-skeleton"
+    title = "The skeleton is not known"
+
+
+class UnknownModelError(FieldError):
+    """No bundle has this name."""
+
+    slug = "unknown-model"
+    title = "The model is not known"
+
+
+class UnavailableError(ServiceError):
+    """The model cannot answer now: still loading, stopping, or its bundle was refused."""
+
+    status = 503
+    slug = "unavailable"
+    title = "The model cannot answer now"
+
+
+class EngineError(ServiceError):
+    """The engine could not compute this request."""
+
+    slug = "prediction-failed"
+    title = "The prediction failed"
+
+
+class GraphError(EngineError):
+    """A graph of the bundle could not run."""
+
+
+class NonFiniteError(EngineError):
+    """A graph of the bundle gave NaN or infinity."""
+
+
+def _where(pointer: str) -> str:
+    """A JSON pointer as programmers write it: /poses/3/11 is poses[3][11]."""
+    parts = pointer.split("/")[1:]
+    where = "".join(f"[{part}]" if part.isdigit() else f".{part}" for part in parts)
+    return where.lstrip(".") or "the body"

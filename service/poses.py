@@ -1,0 +1,96 @@
+"""Nested lists from JSON as an array, or an error that says which number is wrong."""
+
+import json
+import sys
+from collections.abc import Sequence
+from itertools import chain
+from typing import Any, NoReturn
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from service.errors import PosesError
+
+_NUMBERS = {float, int}
+
+
+def poses_array(poses: Sequence[Any], *, num_joints: int) -> Float[np.ndarray, "T J 3"]:
+    """Poses in float64, a joint that is null as three NaN.
+
+    Raises:
+        PosesError: a frame or joint has a wrong shape, or a coordinate is not a finite number.
+    """
+    for frame_index, frame in enumerate(poses):
+        _check_frame(frame, frame_index, num_joints)
+    joints = list(chain.from_iterable(poses))
+    seen = [joint for joint in joints if joint is not None]
+    if set(map(type, seen)) - {list} or set(map(len, seen)) - {3}:
+        _refuse_joint(joints, num_joints)
+    present = np.array([joint is not None for joint in joints], dtype=bool)
+    array = np.full((len(joints), 3), np.nan)
+    array[present] = _finite(list(chain.from_iterable(seen)), np.flatnonzero(present), num_joints)
+    return array.reshape(len(poses), num_joints, 3)
+
+
+def _refuse_joint(joints: Sequence[Any], num_joints: int) -> NoReturn:
+    index = next(
+        i
+        for i, joint in enumerate(joints)
+        if joint is not None and (not isinstance(joint, list) or len(joint) != 3)
+    )
+    raise PosesError(
+        pointer=_pointer(index, num_joints),
+        found=shown(joints[index]),
+        expected="a joint is [x, y, z], or null where it was not seen",
+    )
+
+
+def _check_frame(frame: Any, frame_index: int, num_joints: int) -> None:
+    if not isinstance(frame, list):
+        raise PosesError(
+            pointer=f"/poses/{frame_index}",
+            found=shown(frame),
+            expected=f"a frame is a list of {num_joints} joints",
+        )
+    if len(frame) != num_joints:
+        raise PosesError(
+            pointer=f"/poses/{frame_index}",
+            found=f"{len(frame)} joints",
+            expected=f"the skeleton has {num_joints} joints, and every frame lists them all",
+        )
+
+
+def _finite(
+    numbers: list[Any], joint_indices: Int[np.ndarray, "P"], num_joints: int
+) -> Float[np.ndarray, "P 3"]:
+    if set(map(type, numbers)) <= _NUMBERS:
+        try:
+            array = np.array(numbers, dtype=np.float64).reshape(-1, 3)
+        except OverflowError:  # an integer of more than 308 digits
+            array = np.full((len(joint_indices), 3), np.inf)
+        if np.isfinite(array).all():
+            return array
+    wrong = next(i for i, number in enumerate(numbers) if not _is_finite(number))
+    raise PosesError(
+        pointer=f"{_pointer(int(joint_indices[wrong // 3]), num_joints)}/{wrong % 3}",
+        found=shown(numbers[wrong]),
+        expected="a coordinate is a finite number; a joint that was not seen is null",
+    )
+
+
+def _is_finite(number: Any) -> bool:
+    return type(number) in _NUMBERS and abs(number) <= sys.float_info.max
+
+
+def _pointer(joint_index: int, num_joints: int) -> str:
+    return f"/poses/{joint_index // num_joints}/{joint_index % num_joints}"
+
+
+def shown(value: object) -> str:
+    """What a JSON value is, in a few words."""
+    if isinstance(value, list | dict):
+        return f"{'a list' if isinstance(value, list) else 'an object'} of {len(value)}"
+    if isinstance(value, float) and not np.isfinite(value):
+        return "NaN" if np.isnan(value) else "infinity"
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."

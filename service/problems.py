@@ -1,0 +1,116 @@
+"""Errors as problem+json (RFC 9457), wherever in the application they come from."""
+
+from typing import Any
+
+import orjson
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+
+from service.errors import FieldError, MethodError, NotFoundError, ServiceError
+from service.poses import shown
+from service.schemas import Problem
+
+MEDIA_TYPE = "application/problem+json"
+
+
+def declared(*errors: type[ServiceError]) -> dict[int | str, dict[str, Any]]:
+    """The errors of a route for the OpenAPI document."""
+    return {
+        error.status: {
+            "model": Problem,
+            "description": error.title,
+            "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+        }
+        for error in errors
+    }
+
+
+def add_problem_responses(app: FastAPI) -> None:
+    """Let every error leave the application as a problem."""
+    app.add_exception_handler(ServiceError, _on_service_error)
+    app.add_exception_handler(RequestValidationError, _on_validation_error)
+    app.add_exception_handler(HTTPException, _on_http_exception)
+    app.add_exception_handler(Exception, _on_exception)
+
+
+def problem(error: ServiceError, *, status: int | None = None) -> Response:
+    """The response that tells a caller of an error."""
+    content = {
+        "type": f"/problems/{error.slug}",
+        "title": error.title,
+        "status": status or error.status,
+        "detail": error.detail,
+    }
+    optional = {"pointer": error.pointer, "found": error.found, "expected": error.expected}
+    content |= {key: value for key, value in optional.items() if value}
+    headers = {"Retry-After": "1"} if error.status == 503 else None
+    return Response(
+        orjson.dumps(content),
+        status_code=status or error.status,
+        media_type=MEDIA_TYPE,
+        headers=headers,
+    )
+
+
+async def _on_service_error(_: Request, error: Exception) -> Response:
+    if not isinstance(error, ServiceError):
+        raise error
+    return problem(error)
+
+
+async def _on_validation_error(_: Request, error: Exception) -> Response:
+    if not isinstance(error, RequestValidationError):
+        raise error
+    # The deepest of several complaints is about the variant that the caller meant.
+    first = max(error.errors(), key=lambda e: len(e["loc"]))
+    return problem(_field_error(first, error.body))
+
+
+async def _on_http_exception(request: Request, error: Exception) -> Response:
+    if not isinstance(error, HTTPException):
+        raise error
+    if error.status_code == 404:
+        return problem(
+            NotFoundError(f"{request.url.path}: found nothing here; GET /docs lists every path.")
+        )
+    if error.status_code == 405:
+        allowed = (error.headers or {}).get("Allow", "another method")
+        response = problem(
+            MethodError(f"{request.url.path}: found {request.method}; it takes {allowed}.")
+        )
+        response.headers["Allow"] = allowed
+        return response
+    return problem(ServiceError(str(error.detail)), status=error.status_code)
+
+
+async def _on_exception(_: Request, __: Exception) -> Response:
+    return problem(ServiceError("the server: an unforeseen error; its log says which."))
+
+
+def _field_error(error: dict[str, Any], body: object) -> FieldError:
+    parts, at_fault = _path(error["loc"], body)
+    pointer = "".join(f"/{str(part).replace('~', '~0').replace('/', '~1')}" for part in parts)
+    message = str(error["msg"])
+    expected = message[:1].lower() + message[1:]
+    if error["type"] == "missing":
+        return FieldError(pointer=pointer, found="nothing", expected="this field is required")
+    if error["type"] == "extra_forbidden":
+        return FieldError(
+            pointer=pointer, found="a field that is not known", expected="GET /docs lists them"
+        )
+    return FieldError(pointer=pointer, found=shown(at_fault), expected=expected)
+
+
+def _path(loc: tuple[int | str, ...], body: object) -> tuple[list[int | str], object]:
+    """The part of an error's location that exists in the body; tags of unions do not."""
+    parts: list[int | str] = []
+    for i, part in enumerate(loc[1:] if loc[:1] == ("body",) else loc):
+        last = i == len(loc) - 2
+        if isinstance(body, dict) and (part in body or last):
+            parts.append(part)
+            body = body.get(part)
+        elif isinstance(body, list) and isinstance(part, int) and part < len(body):
+            parts.append(part)
+            body = body[part]
+    return parts, body

@@ -1,0 +1,192 @@
+"""The paths of the service: each turns a request into values, and values into a response."""
+
+import secrets
+from functools import partial
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.responses import JSONResponse
+
+from models.motion.skeleton import SKELETONS
+from service import schemas
+from service.answer import json_answer
+from service.axes import Axes
+from service.body import JsonRoute
+from service.catalog import Catalog, Entry
+from service.engine import trajectory
+from service.errors import (
+    BodyTooLargeError,
+    EngineError,
+    FieldError,
+    MalformedBodyError,
+    MediaTypeError,
+    NotFoundError,
+    PosesError,
+    UnavailableError,
+    UnknownModelError,
+)
+from service.observation import read_observation
+from service.problems import declared, problem
+from service.settings import Settings
+
+router = APIRouter(route_class=JsonRoute)
+
+
+def _catalog(request: Request) -> Catalog:
+    catalog: Catalog = request.app.state.catalog
+    return catalog
+
+
+def _settings(request: Request) -> Settings:
+    settings: Settings = request.app.state.settings
+    return settings
+
+
+_Catalog = Annotated[Catalog, Depends(_catalog)]
+_Settings = Annotated[Settings, Depends(_settings)]
+
+
+@router.post(
+    "/v1/predict",
+    operation_id="predict_v1",
+    response_model=schemas.PredictResponse,
+    responses=declared(
+        MalformedBodyError,
+        BodyTooLargeError,
+        MediaTypeError,
+        FieldError,
+        EngineError,
+        UnavailableError,
+    ),
+)
+@router.post(
+    "/predict",
+    operation_id="predict",
+    response_model=schemas.PredictResponse,
+    responses=declared(
+        MalformedBodyError,
+        BodyTooLargeError,
+        MediaTypeError,
+        FieldError,
+        EngineError,
+        UnavailableError,
+    ),
+)
+async def predict(body: schemas.PredictRequest, catalog: _Catalog, settings: _Settings) -> Response:
+    """N futures of the person in the poses, in the caller's world, skeleton and frame rate."""
+    manifest, worker = catalog.ready(body.model)
+    _check_limits(body, settings)
+    skeleton = body.skeleton or manifest.skeleton.name
+    observation = read_observation(
+        body.poses,
+        skeleton=skeleton if isinstance(skeleton, str) else skeleton.own_joints(),
+        axes=Axes(up=body.axes.up, units=body.axes.units),
+        fps=body.fps or manifest.fps,
+        manifest=manifest,
+    )
+    seed = secrets.randbelow(schemas.MAX_SEED + 1) if body.seed is None else body.seed
+    content = await worker.predict(
+        trajectory.Request(
+            observation=observation.positions,
+            num_samples=body.num_samples,
+            num_steps=body.num_steps,
+            seed=seed,
+        ),
+        partial(
+            json_answer,
+            observation=observation,
+            manifest=manifest,
+            seed=seed,
+            bone_lengths=body.bone_lengths,
+        ),
+    )
+    return Response(content, media_type="application/json")
+
+
+@router.get("/models")
+async def models(catalog: _Catalog) -> schemas.Models:
+    """The bundles of this server, and which of them answers when a request names none."""
+    summaries = [
+        schemas.ModelSummary.model_validate(_summary(entry)) for entry in catalog.entries.values()
+    ]
+    return schemas.Models(default=catalog.default_model, models=summaries)
+
+
+@router.get("/models/{name}", response_model=schemas.ModelDetail, responses=declared(NotFoundError))
+async def model(name: str, catalog: _Catalog) -> schemas.ModelDetail | Response:
+    """One bundle: its manifest in short, its digest and its model card."""
+    try:
+        entry = catalog.entry(name)
+    except UnknownModelError as error:
+        return problem(error, status=404)
+    manifest = entry.manifest
+    detail = _summary(entry) | {
+        "card": entry.card,
+        "recipe": manifest.recipe if manifest else {},
+        "training": manifest.training if manifest else {},
+    }
+    return schemas.ModelDetail.model_validate(detail)
+
+
+@router.get("/skeletons")
+async def skeletons() -> schemas.Skeletons:
+    """The skeletons that a request may name."""
+    return schemas.Skeletons(
+        skeletons=[
+            schemas.StandardSkeleton(name=s.name, joints=list(s.joints), parents=list(s.parents))
+            for s in SKELETONS.values()
+        ]
+    )
+
+
+@router.get("/livez")
+async def livez() -> schemas.Live:
+    """The process answers."""
+    return schemas.Live()
+
+
+@router.get("/readyz", response_model=schemas.Ready, responses={503: {"model": schemas.Ready}})
+async def readyz(catalog: _Catalog) -> Response:
+    """200 once every bundle was tried and warmed up and one can answer; 503 before."""
+    states = {
+        name: f"{entry.state}: {entry.reason}" if entry.reason else entry.state
+        for name, entry in catalog.entries.items()
+    }
+    ready = schemas.Ready(status=catalog.state, default_model=catalog.default_model, models=states)
+    return JSONResponse(ready.model_dump(), status_code=200 if ready.status == "ready" else 503)
+
+
+def _check_limits(body: schemas.PredictRequest, settings: Settings) -> None:
+    if body.num_samples > settings.max_samples:
+        raise FieldError(
+            pointer="/num_samples",
+            found=str(body.num_samples),
+            expected=f"this server gives at most {settings.max_samples}",
+        )
+    if len(body.poses) > settings.max_frames:
+        raise PosesError(
+            pointer="/poses",
+            found=f"{len(body.poses)} frames",
+            expected=f"this server takes at most {settings.max_frames}; send the last ones",
+        )
+
+
+def _summary(entry: Entry) -> dict[str, object]:
+    summary: dict[str, object] = {"name": entry.name, "state": entry.state, "reason": entry.reason}
+    manifest = entry.manifest
+    if manifest is not None:
+        summary |= {
+            "version": manifest.version,
+            "digest": manifest.digest,
+            "description": manifest.description,
+            "licence": manifest.licence,
+            "attribution": list(manifest.attribution),
+            "skeleton": manifest.skeleton.name,
+            "joints": list(manifest.skeleton.joints),
+            "fps": manifest.fps,
+            "num_observed": manifest.num_observed,
+            "horizon": manifest.horizon,
+            "num_steps": manifest.num_steps,
+            "trajectory": manifest.trajectory,
+        }
+    return summary

@@ -1,0 +1,235 @@
+"""What goes over HTTP, for validation and for the OpenAPI document."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, WithJsonSchema
+
+from service.axes import Units, Up
+from service.futures import BoneLengths
+from service.skeletons import OwnJoints
+
+MAX_SEED = 2**53 - 1  # the largest integer that every JSON reader keeps
+
+_POSES_SCHEMA = {
+    "type": "array",
+    "description": "[frames][joints][x, y, z]; the last frame is now. A joint not seen is null.",
+    "items": {
+        "type": "array",
+        "items": {
+            "anyOf": [
+                {
+                    "type": "array",
+                    "items": {"type": "number"},
+                    "minItems": 3,
+                    "maxItems": 3,
+                },
+                {"type": "null"},
+            ]
+        },
+    },
+}
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class SkeletonBody(_Body):
+    """Joints under the caller's own names."""
+
+    joints: list[str] = Field(
+        min_length=8, max_length=256, description="names, in the order of the poses"
+    )
+    map: dict[str, str] | None = Field(
+        default=None, description="{own joint: joint of body21}; by default names are recognised"
+    )
+    parents: list[int] | None = Field(
+        default=None, description="index of each joint's parent, -1 for the root"
+    )
+
+    def own_joints(self) -> OwnJoints:
+        """The same as the service uses it."""
+        parents = None if self.parents is None else tuple(self.parents)
+        return OwnJoints(joints=tuple(self.joints), mapping=self.map, parents=parents)
+
+
+def _kind(skeleton: object) -> str | None:
+    if isinstance(skeleton, dict | SkeletonBody):
+        return "own"
+    return "name" if isinstance(skeleton, str) else None
+
+
+SkeletonField = Annotated[
+    Annotated[str, Tag("name")] | Annotated[SkeletonBody, Tag("own")],
+    Discriminator(
+        _kind,
+        custom_error_type="skeleton",
+        custom_error_message='must be a name, or {"joints": [...], "map": {...}}',
+    ),
+]
+
+
+class AxesBody(_Body):
+    """The caller's coordinates, which are right-handed."""
+
+    up: Up = Field(default="z", description="the axis that points up")
+    units: Units = "m"
+
+
+class PredictRequest(_Body):
+    """An observed motion, and how to continue it."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "poses": [[[0.0, 0.0, 0.93], [0.0, 0.0, 1.04]]],
+                    "skeleton": "body21",
+                    "fps": 30,
+                    "num_samples": 50,
+                    "seed": 7,
+                }
+            ]
+        },
+    )
+
+    poses: Annotated[list[Any], WithJsonSchema(_POSES_SCHEMA)]
+    skeleton: SkeletonField | None = Field(
+        default=None, description="a name of GET /skeletons, or own joints; the model's by default"
+    )
+    axes: AxesBody = AxesBody()
+    fps: float | None = Field(
+        default=None, ge=5, le=300, description="frames per second; the model's by default"
+    )
+    num_samples: int = Field(default=10, ge=1, description="how many futures")
+    num_steps: int | None = Field(
+        default=None, ge=1, description="stop after so many of the model's denoising steps"
+    )
+    seed: int | None = Field(
+        default=None, ge=0, le=MAX_SEED, description="same seed, same futures; drawn by default"
+    )
+    model: str | None = Field(default=None, description="a name of GET /models")
+    bone_lengths: BoneLengths = Field(
+        default="observed",
+        description="`observed` keeps the person's own; `free` is what the network said",
+    )
+
+
+class ModelRef(_Body):
+    """Which bundle answered."""
+
+    name: str
+    version: str
+    digest: str
+
+
+class Steps(_Body):
+    """Denoising steps that ran, of those there are."""
+
+    run: int
+    of: int
+    stopped_by: Literal["end", "num_steps"]
+
+
+class PredictResponse(_Body):
+    """Futures in the caller's world, skeleton, axes, units and rate."""
+
+    id: str
+    model: ModelRef
+    seed: int
+    fps: float
+    skeleton: str
+    joints: list[str]
+    num_frames: int
+    futures: Annotated[
+        list[Any],
+        WithJsonSchema(
+            {
+                "type": "array",
+                "description": "[samples][frames][joints][x, y, z], rounded to 0.1 mm; the first "
+                "frame is one after the last observed",
+                "items": _POSES_SCHEMA,
+            }
+        ),
+    ]
+    steps: Steps
+    warnings: list[str]
+    timing_ms: dict[str, float]
+
+
+class ModelSummary(_Body):
+    """A bundle, and whether it can answer; the rest is null where its manifest is unreadable."""
+
+    name: str
+    state: Literal["loading", "ready", "refused"]
+    reason: str | None = None
+    version: str | None = None
+    digest: str | None = None
+    description: str | None = None
+    licence: str | None = None
+    attribution: list[str] = []
+    skeleton: str | None = None
+    joints: list[str] = []
+    fps: float | None = None
+    num_observed: int | None = None
+    horizon: int | None = None
+    num_steps: int | None = None
+    trajectory: str | None = None
+
+
+class ModelDetail(ModelSummary):
+    """A bundle with its model card."""
+
+    card: str = Field(default="", description="the model card, Markdown")
+    recipe: dict[str, Any] = {}
+    training: dict[str, Any] = {}
+
+
+class Models(_Body):
+    """The bundles of this server."""
+
+    default: str | None
+    models: list[ModelSummary]
+
+
+class StandardSkeleton(_Body):
+    """A skeleton that a request may name."""
+
+    name: str
+    joints: list[str]
+    parents: list[int]
+
+
+class Skeletons(_Body):
+    """The skeletons that a request may name."""
+
+    skeletons: list[StandardSkeleton]
+
+
+class Live(_Body):
+    """The process answers."""
+
+    status: Literal["alive"] = "alive"
+
+
+class Ready(_Body):
+    """Whether predictions are answered, and the state of each bundle."""
+
+    status: Literal["loading", "ready", "unavailable"]
+    default_model: str | None
+    models: dict[str, str]
+
+
+class Problem(BaseModel):
+    """What went wrong (RFC 9457)."""
+
+    type: str = Field(examples=["/problems/unknown-skeleton"])
+    title: str
+    status: int
+    detail: str = Field(description="where, what was found, what would be right")
+    pointer: str | None = Field(default=None, description="the field, as a JSON pointer")
+    found: str | None = None
+    expected: str | None = None

@@ -1,0 +1,33 @@
+"""Fixtures that several folders of tests share."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from in_memory import Service
+from tiny_bundles import X_T_SHAPE, write_diffusion_bundle, write_still_bundle
+
+
+@pytest.fixture(scope="session")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the bundles ``diffusion`` (the default) and ``still``."""
+    folder = tmp_path_factory.mktemp("bundles")
+    write_still_bundle(folder / "still")
+    write_diffusion_bundle(folder / "diffusion")
+    (folder / "DEFAULT").write_text("diffusion\n")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def stochastic_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A diffusion bundle with eta = 1 and a variance for each direction of its noise."""
+    folder = tmp_path_factory.mktemp("stochastic") / "stochastic"
+    return write_diffusion_bundle(folder, eta=1.0, directions=X_T_SHAPE[0])
+
+
+@pytest.fixture(scope="session")
+def service(bundles: Path) -> Iterator[Service]:
+    """The whole application on the bundles ``diffusion`` and ``still``, ready."""
+    with Service.of(bundles) as running:
+        running.wait_until_loaded()
+        yield running

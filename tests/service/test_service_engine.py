@@ -1,0 +1,198 @@
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+from tiny_bundles import NUM_STEPS, X_T_SHAPE, walking
+
+from models.bundle import read_manifest
+from models.diffusion import ddim_step
+from service.engine.engine import Engine, predict
+from service.engine.runner import Runner
+from service.engine.trajectory import Failure, Request, Result
+from service.errors import FieldError, GraphError, NonFiniteError
+
+WALK = walking().astype(np.float32)
+TOO_FAST = walking(speed=99.0).astype(np.float32)
+
+
+def engine_of(folder: Path, rows_per_step: int = 64) -> Engine:
+    return Engine(Runner(read_manifest(folder), folder, threads=1), rows_per_step=rows_per_step)
+
+
+def request(seed: int = 0, num_samples: int = 3, **options: object) -> Request:
+    return Request(observation=WALK, num_samples=num_samples, seed=seed, **options)  # type: ignore[arg-type]
+
+
+def futures(engine: Engine, request: Request) -> np.ndarray:
+    return predict(engine, request).futures
+
+
+def slow_obvious_future(folder: Path, *, seed: int, sample: int, num_steps: int) -> np.ndarray:
+    """One sample, one graph call after another, straight from the files."""
+    manifest = read_manifest(folder)
+    graph = {
+        role: ort.InferenceSession(str(folder / spec.file), providers=["CPUExecutionProvider"])
+        for role, spec in manifest.graphs().items()
+    }
+    assert manifest.schedule is not None
+    alpha_bar = [*manifest.schedule.alpha_bar]
+    variance = [np.array(v)[:, None] for v in manifest.schedule.variance]
+    (context,) = graph["encoder"].run(None, {"observation": WALK[None]})
+    draws = [
+        np.random.Generator(np.random.Philox(key=[seed, sample], counter=[0, 0, 0, k]))
+        .standard_normal(X_T_SHAPE, dtype=np.float32)
+        for k in range(num_steps + 1)
+    ]  # fmt: skip
+    x_t = np.float32(np.sqrt(variance[-1]) * draws[0])
+    for k in range(num_steps):
+        t = NUM_STEPS - 1 - k
+        feed = {"x_t": x_t[None], "timestep": np.array([t]), "context": context}
+        x0 = graph["denoiser"].run(None, feed)[0][0]
+        x_t = np.float32(
+            ddim_step(
+                x_t=x_t,
+                x0=x0,
+                alpha_bar=alpha_bar[t],
+                variance=variance[t],
+                alpha_bar_next=alpha_bar[t - 1] if t else 1.0,
+                variance_next=variance[t - 1] if t else 0.0,
+                eta=manifest.schedule.eta,
+                noise=draws[k + 1],
+            )
+        )
+    feed = {"x0": x0[None], "context": context, "observation": WALK[None]}
+    return graph["decoder"].run(None, feed)[0][0]
+
+
+@pytest.mark.parametrize("num_steps", [1, 4, NUM_STEPS])
+@pytest.mark.parametrize("bundle", ["diffusion", "stochastic"])
+def test_engine_equals_a_loop_over_the_graphs(
+    bundles: Path, stochastic_bundle: Path, bundle: str, num_steps: int
+):
+    folder = stochastic_bundle if bundle == "stochastic" else bundles / bundle
+    answer = futures(engine_of(folder, rows_per_step=5), request(7, num_steps=num_steps))
+    for sample in range(3):
+        expected = slow_obvious_future(folder, seed=7, sample=sample, num_steps=num_steps)
+        np.testing.assert_allclose(answer[sample], expected, atol=1e-6)
+
+
+def test_same_seed_gives_the_same_bytes_and_another_seed_another_future(bundles: Path):
+    engine = engine_of(bundles / "diffusion")
+    first, again, other = (futures(engine, request(seed)) for seed in (5, 5, 6))
+    assert first.tobytes() == again.tobytes()
+    assert np.abs(first - other).max() > 1e-3
+
+
+def test_first_samples_do_not_depend_on_how_many_follow(bundles: Path):
+    engine = engine_of(bundles / "diffusion")
+    many = futures(engine, request(num_samples=40))
+    assert futures(engine, request(num_samples=7)).tobytes() == many[:7].tobytes()
+
+
+@pytest.mark.parametrize("rows_per_step", [1, 7, 64])
+def test_result_does_not_depend_on_strangers(stochastic_bundle: Path, rows_per_step: int):
+    alone = futures(engine_of(stochastic_bundle), request(3, num_samples=9, num_steps=6))
+    engine = engine_of(stochastic_bundle, rows_per_step=rows_per_step)
+    engine.add(request(1, num_samples=20))
+    engine.step()
+    mine = engine.add(request(3, num_samples=9, num_steps=6))
+    for seed in range(4):
+        engine.add(request(seed, num_samples=seed + 1, num_steps=seed + 1))
+    ended: list[Result | Failure] = []
+    while engine.num_requests:
+        ended += engine.step()
+    (result,) = [end for end in ended if end.request_id == mine]
+    assert isinstance(result, Result)
+    assert len(ended) == 6
+    assert result.futures.tobytes() == alone.tobytes()
+
+
+def test_a_step_runs_no_more_rows_than_allowed_and_all_samples_advance_together(bundles: Path):
+    engine = engine_of(bundles / "diffusion", rows_per_step=4)
+    engine.add(request(num_samples=8, num_steps=3))
+    steps = 0
+    while engine.num_requests:
+        engine.step()
+        steps += 1
+    assert steps == 8 * 3 / 4
+
+
+def test_bundle_without_a_denoiser_repeats_its_one_future(bundles: Path):
+    result = predict(engine_of(bundles / "still"), request(num_samples=4))
+    assert (result.steps_run, result.steps_of) == (1, 1)
+    np.testing.assert_array_equal(result.futures, np.broadcast_to(WALK[-1], (4, 60, 21, 3)))
+
+
+def test_early_stop_says_how_many_steps_ran(bundles: Path):
+    result = predict(engine_of(bundles / "diffusion"), request(num_steps=2))
+    assert (result.steps_run, result.steps_of) == (2, NUM_STEPS)
+
+
+def test_run_answers_in_order_and_reads_only_what_it_has_rows_for(bundles: Path):
+    engine = engine_of(bundles / "diffusion", rows_per_step=4)
+    read = 0
+
+    def requests() -> Iterator[Request]:
+        nonlocal read
+        for seed in range(50):
+            read += 1
+            yield request(seed, num_steps=1 + seed % 3)
+
+    answers = [result.futures for result in islice(engine.run(requests()), 5)]
+    assert read < 15
+    for seed, answer in enumerate(answers):
+        alone = futures(engine_of(bundles / "diffusion"), request(seed, num_steps=1 + seed % 3))
+        assert answer.tobytes() == alone.tobytes()
+
+
+def test_nan_fails_its_own_request_and_no_other(bundles: Path):
+    engine = engine_of(bundles / "diffusion")
+    good = [engine.add(request(1)), engine.add(request(2))]
+    bad = engine.add(Request(observation=TOO_FAST, num_samples=2))
+    ended: list[Result | Failure] = []
+    while engine.num_requests:
+        ended += engine.step()
+    assert sorted(end.request_id for end in ended if isinstance(end, Result)) == good
+    (failure,) = [end for end in ended if isinstance(end, Failure)]
+    assert failure.request_id == bad
+    assert isinstance(failure.error, NonFiniteError)
+    with pytest.raises(NonFiniteError, match="encoder gave NaN"):
+        predict(engine, Request(observation=TOO_FAST))
+
+
+def test_cancelled_request_frees_its_rows(bundles: Path):
+    engine = engine_of(bundles / "diffusion", rows_per_step=2)
+    engine.cancel(engine.add(request(num_samples=50)))
+    assert engine.num_requests == 0
+    assert engine.step() == []
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (Request(observation=WALK[1:]), r"shape \(14, 21, 3\)"),
+        (request(num_samples=0), "num_samples: found 0"),
+        (request(num_steps=0), "num_steps: found 0"),
+        (request(num_steps=11), "num_steps: found 11; diffusion runs 1 to 10"),
+    ],
+)
+def test_request_that_does_not_fit_is_refused(bundles: Path, bad: Request, message: str):
+    with pytest.raises(FieldError, match=message):
+        engine_of(bundles / "diffusion").add(bad)
+
+
+def test_file_that_is_no_graph_is_refused(bundles: Path, tmp_path: Path):
+    manifest = read_manifest(bundles / "still")
+    (tmp_path / "decoder.onnx").write_bytes(b"not a graph")
+    with pytest.raises(GraphError, match=r"decoder\.onnx: onnxruntime cannot load it"):
+        Runner(manifest, tmp_path)
+
+
+def test_graph_of_another_shape_fails_the_request(bundles: Path):
+    manifest = read_manifest(bundles / "still").model_copy(update={"num_observed": 9})
+    engine = Engine(Runner(manifest, bundles / "still"))
+    with pytest.raises(GraphError, match="decoder could not run"):
+        predict(engine, Request(observation=WALK[:9]))

@@ -1,0 +1,200 @@
+"""Tiny real bundles, and a person who walks."""
+
+import io
+import warnings
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from models.bundle import (
+    CARD_FILE,
+    GraphSpec,
+    Manifest,
+    ScheduleSpec,
+    SkeletonSpec,
+    TensorSpec,
+    write_bundle,
+)
+from models.diffusion import cosine_schedule
+from models.motion.kinematics import bone_lengths, fit_bone_lengths
+from models.motion.skeleton import BODY21
+
+NUM_OBSERVED, HORIZON, NUM_JOINTS, FPS, NUM_STEPS = 15, 60, 21, 30.0, 10
+X_T_SHAPE = (4, 3)
+
+OBSERVATION = TensorSpec(name="observation", shape=("B", NUM_OBSERVED, NUM_JOINTS, 3))
+CONTEXT = TensorSpec(name="context", shape=("B", 12))
+X_T = TensorSpec(name="x_t", shape=("B", *X_T_SHAPE))
+TIMESTEP = TensorSpec(name="timestep", shape=("B",), dtype="int64")
+X0 = TensorSpec(name="x0", shape=("B", *X_T_SHAPE))
+FUTURE = TensorSpec(name="future", shape=("B", HORIZON, NUM_JOINTS, 3))
+
+
+class Encoder(torch.nn.Module):
+    """Features of the motion; a body that moves by more than 30 m along x makes them NaN."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = torch.nn.Linear(NUM_JOINTS * 3, 12)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        motion = (observation[:, -1] - observation[:, 0]).flatten(1)
+        return torch.tanh(self.linear(motion)) * torch.sqrt(30.0 - motion[:, :1]) / 5.0
+
+
+class Denoiser(torch.nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.time = torch.nn.Embedding(NUM_STEPS, 8)
+        self.net = torch.nn.Sequential(
+            torch.nn.Linear(12 + 12 + 8, 32), torch.nn.SiLU(), torch.nn.Linear(32, 12)
+        )
+
+    def forward(
+        self, x_t: torch.Tensor, timestep: torch.Tensor, context: torch.Tensor
+    ) -> torch.Tensor:
+        joined = torch.cat([x_t.flatten(1), self.time(timestep), context], dim=1)
+        return self.net(joined).reshape(-1, *X_T_SHAPE).clamp(-3.0, 3.0)
+
+
+class Decoder(torch.nn.Module):
+    """The last pose, and a drift that grows from nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = torch.nn.Linear(12 + 12, NUM_JOINTS * 3)
+        self.register_buffer("ramp", torch.linspace(1.0 / HORIZON, 1.0, HORIZON))
+
+    def forward(
+        self, x0: torch.Tensor, context: torch.Tensor, observation: torch.Tensor
+    ) -> torch.Tensor:
+        drift = self.linear(torch.cat([x0.flatten(1), context], 1)).reshape(-1, 1, NUM_JOINTS, 3)
+        return observation[:, -1:] + 0.2 * drift * self.ramp[None, :, None, None]
+
+
+class LastPose(torch.nn.Module):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return observation[:, -1:].expand(-1, HORIZON, -1, -1).contiguous()
+
+
+def exported(
+    module: torch.nn.Module,
+    file: str,
+    *,
+    inputs: tuple[TensorSpec, ...],
+    outputs: tuple[TensorSpec, ...],
+) -> tuple[GraphSpec, bytes]:
+    dummies = tuple(
+        torch.zeros([2, *spec.shape[1:]], dtype=getattr(torch, spec.dtype)) for spec in inputs
+    )
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter warns of its own successor
+        torch.onnx.export(
+            module.eval(),
+            dummies,
+            buffer,
+            dynamo=False,
+            opset_version=17,
+            input_names=[spec.name for spec in inputs],
+            output_names=[spec.name for spec in outputs],
+            dynamic_axes={spec.name: {0: "B"} for spec in (*inputs, *outputs)},
+        )
+    content = buffer.getvalue()
+    digest = sha256(content).hexdigest()
+    return GraphSpec(file=file, sha256=digest, inputs=inputs, outputs=outputs), content
+
+
+def seeded(make: Callable[[], torch.nn.Module], seed: int) -> torch.nn.Module:
+    module = make()
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.4)
+    return module
+
+
+def write(folder: Path, graphs: dict[str, tuple[GraphSpec, bytes]], **fields: object) -> Path:
+    manifest = Manifest(
+        name=folder.name,
+        version="1.0.0",
+        system="made-by-a-test",
+        description="A tiny bundle.",
+        licence="CC0-1.0",
+        skeleton=SkeletonSpec(name=BODY21.name, joints=BODY21.joints, parents=BODY21.parents),
+        fps=FPS,
+        num_observed=NUM_OBSERVED,
+        horizon=HORIZON,
+        symmetries=("translation",),
+        **{role: graph for role, (graph, _) in graphs.items()},  # type: ignore[arg-type]
+        **fields,  # type: ignore[arg-type]
+    )
+    files = {graph.file: content for graph, content in graphs.values()}
+    write_bundle(folder, manifest, files | {CARD_FILE: b"# A tiny bundle\n"})
+    return folder
+
+
+def write_still_bundle(folder: Path) -> Path:
+    """A bundle without a denoiser: every future is the last pose."""
+    decoder = exported(LastPose(), "decoder.onnx", inputs=(OBSERVATION,), outputs=(FUTURE,))
+    return write(folder, {"decoder": decoder})
+
+
+def write_diffusion_bundle(folder: Path, *, eta: float = 0.0, directions: int = 1) -> Path:
+    """A bundle of three graphs with fixed random weights and K = 10."""
+    schedule = cosine_schedule(NUM_STEPS)
+    stretch = np.linspace(1.0, 0.5, directions)
+    spec = ScheduleSpec(
+        alpha_bar=tuple(schedule.alpha_bar),
+        variance=tuple(map(tuple, schedule.variance * stretch)),
+        eta=eta,
+    )
+    graphs = {
+        "encoder": exported(
+            seeded(Encoder, 1), "encoder.onnx", inputs=(OBSERVATION,), outputs=(CONTEXT,)
+        ),
+        "denoiser": exported(
+            seeded(Denoiser, 2), "denoiser.onnx", inputs=(X_T, TIMESTEP, CONTEXT), outputs=(X0,)
+        ),
+        "decoder": exported(
+            seeded(Decoder, 3), "decoder.onnx", inputs=(X0, CONTEXT, OBSERVATION), outputs=(FUTURE,)
+        ),
+    }
+    return write(folder, graphs, schedule=spec, x_t_shape=X_T_SHAPE)
+
+
+# Rest pose of a person of 1.75 m who faces +X, hips at the origin.
+_HALF = {
+    "shoulder": (0.0, 0.03, 0.42), "upper_arm": (0.0, 0.18, 0.42), "lower_arm": (0.02, 0.2, 0.14),
+    "hand": (0.06, 0.22, -0.1), "upper_leg": (0.0, 0.09, -0.05), "lower_leg": (0.02, 0.1, -0.47),
+    "foot": (-0.02, 0.1, -0.88), "toes": (0.12, 0.11, -0.94),
+}  # fmt: skip
+_MIDDLE = {
+    "hips": (0.0, 0.0, 0.0), "spine": (0.0, 0.0, 0.1), "chest": (-0.01, 0.0, 0.25),
+    "neck": (0.0, 0.0, 0.48), "head": (0.03, 0.0, 0.58),
+}  # fmt: skip
+
+
+def standing_pose() -> np.ndarray:
+    """(21, 3) metres, a person facing +X on the ground."""
+    rows = []
+    for joint in BODY21.joints:
+        side, _, part = joint.partition("_")
+        x, y, z = _MIDDLE[joint] if joint in _MIDDLE else _HALF[part]
+        rows.append((x, -y if side == "right" else y, z + 0.96))
+    return np.array(rows)
+
+
+def walking(num_frames: int = NUM_OBSERVED, *, fps: float = FPS, speed: float = 1.2) -> np.ndarray:
+    """(T, 21, 3) metres: a rigid person's stiff walk along +X that ends at time 0, arms and legs swinging."""
+    times = np.arange(1 - num_frames, 1) / fps
+    poses = np.repeat(standing_pose()[None], num_frames, axis=0)
+    poses[:, :, 0] += speed * times[:, None]
+    for joint, name in enumerate(BODY21.joints):
+        reach = {"left": 0.25, "right": -0.25}.get(name.split("_")[0], 0.0)
+        depth = np.clip(0.96 - standing_pose()[joint, 2], 0.0, 1.0)
+        poses[:, joint, 0] += reach * depth * np.sin(2 * np.pi * times)
+    return fit_bone_lengths(poses, bone_lengths(standing_pose(), BODY21.parents), BODY21.parents)

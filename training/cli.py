@@ -1,0 +1,190 @@
+"""Command line ``posefutures-train``: prepare, train, export, evaluate."""
+
+import importlib
+import shlex
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+
+from models.bundle import BundleError, read_manifest
+from models.motion.formats.errors import FormatError
+from models.system import Recipe
+from training.checkpoint import CheckpointError
+from training.contact_sheet import contact_sheet
+from training.data.batches import training_clips
+from training.data.prepare import PrepareError, prepare
+from training.data.store import StoreError, open_store, select
+from training.data.windows import Windows, cut
+from training.evaluate import EvaluateError, evaluate
+from training.export import ExportError, Label, export
+from training.loop import RunError, train, trained_network
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Prepare motion, train a recipe, export a bundle, evaluate bundles.",
+)
+ERRORS = (
+    BundleError,
+    CheckpointError,
+    EvaluateError,
+    ExportError,
+    FormatError,
+    PrepareError,
+    RunError,
+    StoreError,
+)
+RecipeArgument = Annotated[
+    str, typer.Argument(help="Dotted path and name, such as models.systems.NAME.recipes:mocap.")
+]
+StoreOption = Annotated[Path, typer.Option(help="Folder made by prepare.")]
+
+
+class RecipeError(Exception):
+    """No recipe has that name."""
+
+
+def main() -> None:
+    """Run the command line; every expected error is one line."""
+    try:
+        app()
+    except (*ERRORS, RecipeError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def load_recipe(path: str) -> Recipe:
+    """The recipe that a dotted path names.
+
+    Raises:
+        RecipeError: the path is malformed or names no recipe.
+    """
+    module, _, name = path.partition(":")
+    try:
+        make: Callable[[], Recipe] = getattr(importlib.import_module(module), name)
+        recipe = make()
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise RecipeError(
+            f"recipe: found {path!r} ({error}); must be package.module:function."
+        ) from error
+    if not isinstance(recipe, Recipe):
+        raise RecipeError(f"recipe: {path!r} returns {type(recipe).__name__}; must be a Recipe.")
+    return recipe
+
+
+@app.command("prepare")
+def prepare_command(
+    sources: Annotated[list[Path], typer.Argument(help="Folders of BVH or AMC, or npz archives.")],
+    out: Annotated[Path, typer.Option(help="Folder of the store.")],
+) -> None:
+    """Turn public motion files into a store, with a report of what was dropped and why."""
+    typer.echo(prepare(sources, out).table())
+
+
+@app.command("train")
+def train_command(
+    recipe: RecipeArgument,
+    store: StoreOption,
+    out: Annotated[Path, typer.Option(help="Folder of the run; a killed run continues there.")],
+    device: Annotated[str, typer.Option(help="cpu or cuda; the GPU if there is one.")] = "",
+    seed: Annotated[int, typer.Option(help="Of weights, windows and noise.")] = 0,
+) -> None:
+    """Train every stage of a recipe."""
+    chosen = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    train(load_recipe(recipe), open_store(store), out, device=torch.device(chosen), seed=seed)
+
+
+@app.command("export")
+def export_command(
+    recipe: RecipeArgument,
+    run: Annotated[Path, typer.Argument(help="Folder of the finished run.")],
+    store: StoreOption,
+    out: Annotated[Path, typer.Option(help="Folder of the bundle; its name names the bundle.")],
+    card: Annotated[Path, typer.Option(help="The model card, Markdown.")],
+    licence: Annotated[str, typer.Option(help="Licence of the weights.")],
+    attribution: Annotated[list[str] | None, typer.Option(help="A text that users owe.")] = None,
+    version: Annotated[str, typer.Option(help="Version of the bundle.")] = "1",
+    machine: Annotated[str, typer.Option(help="What it was trained on, for the manifest.")] = "",
+) -> None:
+    """Write the bundle of a finished run, if torch and onnxruntime agree."""
+    chosen = load_recipe(recipe)
+    network, progress = trained_network(chosen, run)
+    training = {
+        "updates": progress.total_updates,
+        "hours": round(progress.seconds / 3600, 2),
+        "machine": machine,
+    }
+    manifest = export(
+        chosen,
+        network,
+        out,
+        label=Label(
+            name=out.name,
+            version=version,
+            licence=licence,
+            attribution=tuple(attribution or ()),
+            training=training if chosen.stages else {},
+        ),
+        card=card.read_text(),
+        observations=_some_observations(chosen, store),
+    )
+    typer.echo(f"{out}: {manifest.name} {manifest.version}, digest {manifest.digest}")
+
+
+def _some_observations(recipe: Recipe, store: Path) -> np.ndarray:
+    opened, frames = open_store(store), recipe.data.num_observed
+    windows = Windows.of(training_clips(opened, recipe.data), num_frames=frames)
+    spread = np.linspace(0, len(windows) - 1, 5).astype(int)
+    return cut(opened, windows, num_frames=frames, indices=spread)
+
+
+@app.command("evaluate")
+def evaluate_command(
+    bundles: Annotated[list[Path], typer.Argument(help="Folders of bundles to compare.")],
+    store: StoreOption,
+    out: Annotated[Path, typer.Option(help="Folder for evaluation.json and evaluation.md.")],
+    group: Annotated[
+        list[str],
+        typer.Option(help="name:selector[,selector…], such as style:style=tired."),
+    ],
+    num_samples: Annotated[int, typer.Option(help="Futures for each window.")] = 50,
+    num_steps: Annotated[int | None, typer.Option(help="Stop after so many steps.")] = None,
+    stride: Annotated[int, typer.Option(help="Frames between windows.")] = 10,
+    max_windows: Annotated[int, typer.Option(help="Windows of a group at most.")] = 300,
+    seed: Annotated[int, typer.Option(help="Of the samples.")] = 0,
+    sheet: Annotated[Path | None, typer.Option(help="Also draw ten windows to this PNG.")] = None,
+) -> None:
+    """Measure bundles through the service's own engine, beside the baselines."""
+    started = time.monotonic()
+    opened = open_store(store)
+    groups = dict(_group(text) for text in group)
+    command = f"posefutures-train {shlex.join(sys.argv[1:])}"
+    table = evaluate(
+        [(folder, read_manifest(folder)) for folder in bundles],
+        opened,
+        groups,
+        out=out,
+        num_samples=num_samples,
+        num_steps=num_steps,
+        stride=stride,
+        max_windows=max_windows,
+        seed=seed,
+        command=command,
+    )
+    typer.echo(table)
+    if sheet:
+        contact_sheet(bundles[0], opened, select(opened.clips, next(iter(groups.values()))), sheet)
+    typer.echo(f"{time.monotonic() - started:.0f} s", err=True)
+
+
+def _group(text: str) -> tuple[str, tuple[str, ...]]:
+    name, _, selectors = text.partition(":")
+    if not selectors:
+        raise StoreError(f"group: found {text!r}; must be name:selector[,selector…].")
+    return name, tuple(selectors.split(","))

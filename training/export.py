@@ -1,0 +1,259 @@
+"""From a trained network to a bundle: graphs, parity, manifest; all or nothing."""
+
+import datetime
+import hashlib
+import io
+import tempfile
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from models.bundle import (
+    CARD_FILE,
+    GraphSpec,
+    Manifest,
+    ScheduleSpec,
+    SkeletonSpec,
+    TensorSpec,
+    write_bundle,
+)
+from models.diffusion import ddim_step, timesteps
+from models.system import Graph, Recipe, describe
+from service.engine.engine import Engine
+from service.engine.runner import Runner
+from service.engine.sampling import x_first
+from service.engine.trajectory import Request
+
+OPSET = 17
+PARITY_M = 1e-4
+PARITY_BATCHES = (1, 5)
+MAX_GRAPH_BYTES = 15 * 2**20
+BATCH = "B"
+
+
+class ExportError(Exception):
+    """A bundle was not written."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Label:
+    """What a bundle says of itself beside what the recipe knows."""
+
+    name: str
+    version: str
+    licence: str
+    attribution: tuple[str, ...] = ()
+    description: str | None = None
+    training: Mapping[str, Any] | None = None
+
+
+def export(
+    recipe: Recipe,
+    network: nn.Module,
+    folder: Path,
+    *,
+    label: Label,
+    card: str,
+    observations: Float[np.ndarray, "S T J 3"],
+) -> Manifest:
+    """Write the bundle of a trained network and return its manifest.
+
+    Args:
+        recipe: what the network was built from.
+        network: the trained network; it is left in evaluation mode on the CPU.
+        folder: where the bundle goes; an older one there is replaced.
+        label: name, version, licence and attribution.
+        card: the model card, Markdown.
+        observations: at least five real or plausible observations, metres, for the parity check.
+
+    Raises:
+        ExportError: torch and onnxruntime differ by more than 1e-4 m, a graph is over 15 MB, or
+            a graph asks for a tensor that none gives. Nothing is written then.
+    """
+    graphs = {graph.role: graph for graph in recipe.graphs(network.eval().cpu())}
+    seen = observations[: max(PARITY_BATCHES)].astype(np.float32)
+    tensors = _example(recipe, graphs, torch.from_numpy(seen[:2]))
+    specs, files = {}, {CARD_FILE: card.encode()}
+    for role, graph in graphs.items():
+        content = _onnx(graph, tensors)
+        if len(content) > MAX_GRAPH_BYTES:
+            raise ExportError(
+                f"{role}: found {len(content) / 2**20:.1f} MB; a graph that ships is at most "
+                f"{MAX_GRAPH_BYTES / 2**20:.0f} MB."
+            )
+        specs[role] = _spec(graph, content, tensors)
+        files[specs[role].file] = content
+    manifest = _manifest(recipe, label, specs)
+    with tempfile.TemporaryDirectory() as scratch:
+        trial = Path(scratch) / label.name
+        write_bundle(trial, manifest, files)
+        _check_parity(recipe, graphs, manifest, trial, seen)
+    write_bundle(folder, manifest, files)
+    return manifest
+
+
+def _example(
+    recipe: Recipe, graphs: Mapping[str, Graph], observation: Float[Tensor, "B T J 3"]
+) -> dict[str, Tensor]:
+    rows = len(observation)
+    tensors = {"observation": observation}
+    if recipe.schedule:
+        tensors["x_t"] = torch.zeros(rows, *recipe.x_t_shape)
+        tensors["timestep"] = torch.arange(rows)
+    for role in ("encoder", "denoiser", "decoder"):
+        if role in graphs:
+            tensors |= _run(graphs[role], tensors)
+    return tensors
+
+
+@torch.no_grad()
+def _run(graph: Graph, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    missing = [name for name in graph.inputs if name not in tensors]
+    if missing:
+        raise ExportError(
+            f"{graph.role}: asks for {', '.join(missing)}; the graphs before it give "
+            f"{', '.join(tensors)}."
+        )
+    result = graph.module(*(tensors[name] for name in graph.inputs))
+    outputs = result if isinstance(result, tuple) else (result,)
+    return dict(zip(graph.outputs, outputs, strict=True))
+
+
+def _onnx(graph: Graph, tensors: Mapping[str, Tensor]) -> bytes:
+    buffer = io.BytesIO()
+    names = [*graph.inputs, *graph.outputs]
+    with warnings.catch_warnings():
+        # The exporter warns that it is the older of two. The newer one gives larger graphs that
+        # run no faster, and takes a minute where this one takes a second.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            graph.module,
+            tuple(tensors[name] for name in graph.inputs),
+            buffer,
+            input_names=list(graph.inputs),
+            output_names=list(graph.outputs),
+            dynamic_axes={name: {0: BATCH} for name in names},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+    model = onnx.load_model_from_string(buffer.getvalue())
+    for node in model.graph.node:
+        node.doc_string = ""  # this machine's paths
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString(deterministic=True))
+
+
+def _spec(graph: Graph, content: bytes, tensors: Mapping[str, Tensor]) -> GraphSpec:
+    def spec(name: str) -> TensorSpec:
+        value = tensors[name]
+        dtype = "int64" if value.dtype == torch.int64 else "float32"
+        return TensorSpec(name=name, shape=(BATCH, *value.shape[1:]), dtype=dtype)
+
+    return GraphSpec(
+        file=f"{graph.role}.onnx",
+        sha256=hashlib.sha256(content).hexdigest(),
+        inputs=tuple(spec(name) for name in graph.inputs),
+        outputs=tuple(spec(name) for name in graph.outputs),
+    )
+
+
+def _manifest(recipe: Recipe, label: Label, specs: Mapping[str, GraphSpec]) -> Manifest:
+    data, schedule = recipe.data, recipe.schedule
+    training = {"exported": datetime.datetime.now(datetime.UTC).date().isoformat()}
+    fields: dict[str, Any] = {
+        "name": label.name,
+        "version": label.version,
+        "system": recipe.system,
+        "description": label.description or recipe.description,
+        "licence": label.licence,
+        "attribution": label.attribution,
+        "skeleton": SkeletonSpec(
+            name=data.skeleton.name, joints=data.skeleton.joints, parents=data.skeleton.parents
+        ),
+        "fps": data.fps,
+        "num_observed": data.num_observed,
+        "horizon": data.horizon,
+        "trajectory": recipe.trajectory,
+        "symmetries": recipe.symmetries,
+        "x_t_shape": recipe.x_t_shape,
+        "recipe": describe(recipe),
+        "training": training | dict(label.training or {}),
+    }
+    if schedule:
+        fields["schedule"] = ScheduleSpec(
+            alpha_bar=tuple(schedule.alpha_bar.tolist()),
+            variance=tuple(tuple(row) for row in schedule.variance.tolist()),
+        )
+    return Manifest(**fields, **specs)
+
+
+def reference_futures(
+    recipe: Recipe,
+    graphs: Mapping[str, Graph],
+    observation: Float[np.ndarray, "B T J 3"],
+    *,
+    seed: int,
+) -> Float[np.ndarray, "B H J 3"]:
+    """Sample 0 of each observation by the whole loop in torch, with the server's own noise."""
+    tensors = {"observation": torch.from_numpy(observation)}
+    if "encoder" in graphs:
+        tensors |= _run(graphs["encoder"], tensors)
+    if recipe.schedule:
+        tensors["x0"] = _denoised(recipe, graphs["denoiser"], tensors, seed)
+    return _run(graphs["decoder"], tensors)["future"].numpy()
+
+
+def _denoised(
+    recipe: Recipe, denoiser: Graph, tensors: Mapping[str, Tensor], seed: int
+) -> Tensor:
+    schedule = recipe.schedule
+    if schedule is None:
+        raise ExportError("denoiser: the recipe has no schedule.")
+    rows = len(tensors["observation"])
+    first = x_first(recipe.x_t_shape, schedule=schedule, seed=seed, sample_index=0)
+    x_t = torch.from_numpy(first).expand(rows, *recipe.x_t_shape)
+    x0 = x_t
+    for t in timesteps(schedule.num_steps, schedule.num_steps):
+        timestep = torch.full((rows,), t)
+        x0 = _run(denoiser, {**tensors, "x_t": x_t, "timestep": timestep})["x0"]
+        following = (schedule.alpha_bar[t - 1], schedule.variance[t - 1]) if t else (1.0, [0.0])
+        x_t = ddim_step(
+            x_t=x_t,
+            x0=x0,
+            alpha_bar=float(schedule.alpha_bar[t]),
+            variance=torch.tensor(schedule.variance[t], dtype=torch.float32),
+            alpha_bar_next=float(following[0]),
+            variance_next=torch.tensor(following[1], dtype=torch.float32),
+        )
+    return x0
+
+
+def _check_parity(
+    recipe: Recipe,
+    graphs: Mapping[str, Graph],
+    manifest: Manifest,
+    folder: Path,
+    observations: Float[np.ndarray, "S T J 3"],
+) -> None:
+    for rows in PARITY_BATCHES:
+        engine = Engine(Runner(manifest, folder), rows_per_step=rows)
+        requests = [
+            Request(observation=observation, num_samples=1, seed=7)
+            for observation in observations[:rows]
+        ]
+        served = np.concatenate([result.futures for result in engine.run(requests)])
+        expected = reference_futures(recipe, graphs, observations[:rows], seed=7)
+        worst = float(np.abs(served - expected).max())
+        if not worst <= PARITY_M:
+            raise ExportError(
+                f"parity: torch and onnxruntime differ by {worst:.2e} m at batch {rows}; "
+                f"they must agree to {PARITY_M:.0e} m."
+            )
