@@ -101,7 +101,7 @@ def ddim_step(  # noqa: PLR0913 - the seven symbols of the equation
     eta: float = 0.0,
     noise: Any = 0.0,
 ) -> Any:
-    """x at the next, less noisy timestep, from x_t and the denoiser's x0 (Song et al. 2021, eq. 12).
+    """x at the next, less noisy timestep, from x_t and x0 (Song et al. 2021, eq. 12).
 
     eta = 0 is DDIM and ignores the noise; eta = 1 is the posterior of DDPM, isotropic or, with one
     variance for each direction, nonisotropic (Curreli et al. 2025, eq. 7). After timestep 0 pass

@@ -1,5 +1,6 @@
 """Blocks that several networks share, in torch."""
 
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ class MLP(nn.Sequential):
 
     def __init__(self, *widths: int) -> None:
         layers: list[nn.Module] = []
-        for narrow, wide in zip(widths[:-1], widths[1:], strict=True):
+        for narrow, wide in pairwise(widths):
             layers += [nn.Linear(narrow, wide), nn.SiLU()]
         super().__init__(*layers[:-1])
 
@@ -56,5 +57,5 @@ class _Reversal(torch.autograd.Function):
 
 def reverse_gradient(x: Float[Tensor, "B D"], weight: Float[Tensor, "B 1"]) -> Float[Tensor, "B D"]:
     """The same tensor, whose gradient arrives times -weight (Ganin and Lempitsky 2015)."""
-    result: Tensor = _Reversal.apply(x, weight)  # type: ignore[no-untyped-call]  # torch's stub
+    result: Tensor = _Reversal.apply(x, weight)
     return result

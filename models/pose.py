@@ -41,16 +41,12 @@ class Frame:
     def enter(self, world: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
         """Poses of the world in the canonical frame."""
         x, y, z = (world - self.origin).unbind(dim=-1)
-        return torch.stack(
-            [self.cos * x + self.sin * y, self.cos * y - self.sin * x, z], dim=-1
-        )
+        return torch.stack([self.cos * x + self.sin * y, self.cos * y - self.sin * x, z], dim=-1)
 
     def leave(self, canonical: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
         """Poses of the canonical frame in the world."""
         x, y, z = canonical.unbind(dim=-1)
-        turned = torch.stack(
-            [self.cos * x - self.sin * y, self.cos * y + self.sin * x, z], dim=-1
-        )
+        turned = torch.stack([self.cos * x - self.sin * y, self.cos * y + self.sin * x, z], dim=-1)
         return turned + self.origin
 
 

@@ -16,7 +16,10 @@ from models.diffusion import Schedule
 from models.motion.skeleton import Skeleton
 
 Batch = Mapping[str, Tensor]
-"""``observation (B, T, J, 3)`` and ``future (B, H, J, 3)``, metres, in the world of the capture."""
+"""``observation (B, T, J, 3)``, ``seen``, the same with sensor noise, and ``future (B, H, J, 3)``.
+
+All in metres, in the world of the capture.
+"""
 
 Losses = dict[str, Tensor]
 """Named scalar terms; the loop minimises ``total``."""

@@ -55,10 +55,10 @@ class Catalog:
         for entry in sorted(self.entries.values(), key=lambda e: e.name != self.default_model):
             try:
                 self._load(entry)
-            except (BundleError, EngineError) as error:
-                entry.reason = str(error)
-                entry.state = "refused"
-                _log.error("bundle %s is refused: %s", entry.name, error)
+            except (BundleError, EngineError, ValueError) as error:
+                _refuse(entry, str(error))
+            except OSError as error:  # its text holds the whole path, which is nobody's business
+                _refuse(entry, f"{entry.name}: a file cannot be read: {error.strerror}.")
 
     def entry(self, name: str) -> Entry:
         """The bundle of this name, in whatever state.
@@ -105,6 +105,12 @@ class Catalog:
         entry.state = "ready"
 
 
+def _refuse(entry: Entry, reason: str) -> None:
+    entry.reason = reason
+    entry.state = "refused"
+    _log.error("bundle %s is refused: %s", entry.name, reason)
+
+
 def bundle_names(folder: Path) -> list[str]:
     """The folders that are bundles, or should be, by name."""
     if not folder.is_dir():
@@ -125,7 +131,7 @@ def load_bundle(folder: Path, *, threads: int) -> tuple[Engine, str]:
             f"{folder.name}/manifest.json: name: found {manifest.name!r}; it must be the folder's."
         )
     card = folder / CARD_FILE
-    text = card.read_text(encoding="utf-8") if card.is_file() else ""
+    text = card.read_text(encoding="utf-8", errors="replace") if card.is_file() else ""
     return Engine(Runner(manifest, folder, threads=threads)), text
 
 

@@ -31,8 +31,10 @@ def caller_futures(
     paths = _at_rate(futures.astype(np.float64), last, skeleton, manifest=manifest, fps=caller.fps)
     answer = _in_skeleton(paths, last, skeleton, caller)
     if bone_lengths == "observed":
-        answer = fit_bone_lengths(answer, caller.bones, caller.skeleton.parents)
-    return np.asarray(answer + caller.offset)
+        answer = fit_bone_lengths(answer, caller.bones, caller.bone_parents)
+    in_world = np.asarray(answer + caller.offset)
+    in_world[:, :, caller.fixed] = caller.last_pose[caller.fixed] + caller.offset
+    return in_world
 
 
 def written(
@@ -86,6 +88,8 @@ def _in_skeleton(
 
     The difference turns with the body, so nothing jumps at the first frame.
     """
+    if skeleton.joints == caller.skeleton.joints:
+        return paths
     weights, _ = joint_map(skeleton, caller.skeleton)
     estimate: np.ndarray = np.einsum("ij,nhjk->nhik", weights, paths, optimize=True)
     difference = caller.last_pose - np.matmul(weights, last)

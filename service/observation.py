@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float
 from models.bundle import Manifest
 from models.motion.kinematics import bone_lengths
 from models.motion.motion import Motion
-from models.motion.skeleton import Skeleton, SkeletonError, joint_map
+from models.motion.skeleton import Skeleton, SkeletonError, joint_map, resolve_joints
 from service.axes import Axes
 from service.errors import PosesError, TooFewFramesError, UnknownSkeletonError
 from service.person import check_person
 from service.poses import poses_array
-from service.skeletons import OwnJoints, own_skeleton, standard_skeleton, without_joints
+from service.skeletons import OwnJoints, own_skeleton, without_joints
 
 MAX_HEIGHT_M = 10.0  # of the lowest joint over z = 0; above, it is brought down to the ground
 
@@ -26,7 +26,8 @@ class Caller:
     """How the caller describes the person, and the person as last seen.
 
     Joints are in the order of ``skeleton``; ``order`` is each one's index in the caller's lists.
-    Positions are metres, +Z up; adding ``offset`` puts them back into the caller's world.
+    Positions are metres, +Z up; adding ``offset`` puts them back into the caller's world. ``fixed``
+    joints are points of the scene, such as a file's root; ``bone_parents`` is -1 where no bone is.
     """
 
     skeleton: Skeleton
@@ -36,6 +37,8 @@ class Caller:
     offset: Float[np.ndarray, "3"]
     last_pose: Float[np.ndarray, "J 3"]
     bones: Float[np.ndarray, "J"]
+    bone_parents: tuple[int, ...]
+    fixed: Bool[np.ndarray, "J"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -50,7 +53,7 @@ class Observation:
 def read_observation(
     poses: Sequence[Any],
     *,
-    skeleton: str | OwnJoints,
+    skeleton: Skeleton | OwnJoints,
     axes: Axes,
     fps: float,
     manifest: Manifest,
@@ -60,14 +63,14 @@ def read_observation(
     Raises:
         PosesError: the poses are not those of a person.
         TooFewFramesError: they are shorter than the bundle needs.
-        UnknownSkeletonError: the skeleton is not known.
+        UnknownSkeletonError: own joints do not make a body.
     """
     if isinstance(skeleton, OwnJoints):
         world = axes.to_metres(poses_array(poses, num_joints=len(skeleton.joints)))
         pose = world[-1] if len(world) else np.full((len(skeleton.joints), 3), np.nan)
         tree, order = own_skeleton(skeleton, pose)
     else:
-        tree = standard_skeleton(skeleton)
+        tree = skeleton
         order = tuple(range(tree.num_joints))
         world = axes.to_metres(poses_array(poses, num_joints=tree.num_joints))
     return observe(
@@ -91,11 +94,12 @@ def observe(
         TooFewFramesError: they are shorter than the bundle needs.
     """
     num_frames = _num_frames(len(world), fps, manifest)
-    check_person(world, order=order, units=axes.units)
+    target = manifest.skeleton.skeleton()
+    used = _used(skeleton, target)
+    check_person(world[:, used], order=[order[j] for j in used], units=axes.units)
     # One frame more than needed where there is one, so that another rate has a value to aim from.
     window, warnings = _filled(world[-num_frames - 1 :], skeleton)
     seen = np.isfinite(window[0, :, 0])
-    target = manifest.skeleton.skeleton()
     weights, guessed = _weights(skeleton, seen, target)
     root = np.matmul(weights[0], window[-1, seen])
     lowest = float(window[-1, seen, 2].min())
@@ -104,6 +108,7 @@ def observe(
     mapped = np.einsum("ij,tjk->tik", weights, near[:, seen])
     back, _ = joint_map(target, skeleton)
     near[:, ~seen] = np.einsum("ij,tjk->tik", back[~seen], mapped)
+    fixed = _fixed(near, used)
     caller = Caller(
         skeleton=skeleton,
         order=order,
@@ -112,6 +117,8 @@ def observe(
         offset=offset,
         last_pose=near[-1],
         bones=np.median(bone_lengths(near[-num_frames:], skeleton.parents), axis=0),
+        bone_parents=_bone_parents(skeleton, fixed),
+        fixed=fixed,
     )
     positions = _at_rate(mapped, fps, manifest).astype(np.float32)
     return Observation(positions=positions, caller=caller, warnings=(*warnings, *guessed))
@@ -176,6 +183,34 @@ def _weights(
     if guessed:
         warnings.append(f"skeleton: the model's {', '.join(guessed)} had to be guessed from yours.")
     return weights, warnings
+
+
+def _used(skeleton: Skeleton, target: Skeleton) -> list[int]:
+    """The joints that the model sees; a file may hold others, such as the origin of its scene."""
+    weights, _ = _weights(skeleton, np.ones(skeleton.num_joints, dtype=bool), target)
+    return [int(joint) for joint in np.flatnonzero(weights.any(axis=0))]
+
+
+def _fixed(near: Float[np.ndarray, "T J 3"], used: Sequence[int]) -> Bool[np.ndarray, "J"]:
+    """Which joints held still to a millimetre while the body moved."""
+    moved = np.linalg.norm(near - near[-1], axis=-1).max(axis=0)
+    fixed = (moved < 1e-3) & (moved[list(used)].min() > 1e-2)
+    fixed[list(used)] = False
+    return np.asarray(fixed)
+
+
+def _bone_parents(skeleton: Skeleton, fixed: Bool[np.ndarray, "J"]) -> tuple[int, ...]:
+    """Parents without those that no bone joins to their child: above the hips, or fixed."""
+    loose = {int(joint) for joint in np.flatnonzero(fixed)}
+    hips = resolve_joints(skeleton).get("hips", skeleton.joints[0])
+    above = skeleton.parents[skeleton.index(hips)]
+    while above >= 0:
+        loose.add(above)
+        above = skeleton.parents[above]
+    return tuple(
+        -1 if joint in loose or parent in loose else parent
+        for joint, parent in enumerate(skeleton.parents)
+    )
 
 
 def _at_rate(

@@ -7,7 +7,8 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Request, Response
 from fastapi.responses import JSONResponse
 
-from models.motion.skeleton import SKELETONS
+from models.bundle import Manifest
+from models.motion.skeleton import SKELETONS, Skeleton
 from service import schemas
 from service.answer import json_answer
 from service.axes import Axes
@@ -28,6 +29,7 @@ from service.errors import (
 from service.observation import read_observation
 from service.problems import declared, problem
 from service.settings import Settings
+from service.skeletons import OwnJoints, standard_skeleton
 
 router = APIRouter(route_class=JsonRoute)
 
@@ -76,10 +78,9 @@ async def predict(body: schemas.PredictRequest, catalog: _Catalog, settings: _Se
     """N futures of the person in the poses, in the caller's world, skeleton and frame rate."""
     manifest, worker = catalog.ready(body.model)
     _check_limits(body, settings)
-    skeleton = body.skeleton or manifest.skeleton.name
     observation = read_observation(
         body.poses,
-        skeleton=skeleton if isinstance(skeleton, str) else skeleton.own_joints(),
+        skeleton=_skeleton(body, manifest),
         axes=Axes(up=body.axes.up, units=body.axes.units),
         fps=body.fps or manifest.fps,
         manifest=manifest,
@@ -154,6 +155,14 @@ async def readyz(catalog: _Catalog) -> Response:
     }
     ready = schemas.Ready(status=catalog.state, default_model=catalog.default_model, models=states)
     return JSONResponse(ready.model_dump(), status_code=200 if ready.status == "ready" else 503)
+
+
+def _skeleton(body: schemas.PredictRequest, manifest: Manifest) -> Skeleton | OwnJoints:
+    if isinstance(body.skeleton, schemas.SkeletonBody):
+        return body.skeleton.own_joints()
+    if body.skeleton is None or body.skeleton == manifest.skeleton.name:
+        return manifest.skeleton.skeleton()
+    return standard_skeleton(body.skeleton)
 
 
 def _check_limits(body: schemas.PredictRequest, settings: Settings) -> None:

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, WithJsonSchema
 
 from service.axes import Units, Up
+from service.example import EXAMPLE
 from service.futures import BoneLengths
 from service.skeletons import OwnJoints
 
@@ -79,22 +80,7 @@ class AxesBody(_Body):
 class PredictRequest(_Body):
     """An observed motion, and how to continue it."""
 
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        strict=True,
-        json_schema_extra={
-            "examples": [
-                {
-                    "poses": [[[0.0, 0.0, 0.93], [0.0, 0.0, 1.04]]],
-                    "skeleton": "body21",
-                    "fps": 30,
-                    "num_samples": 50,
-                    "seed": 7,
-                }
-            ]
-        },
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
 
     poses: Annotated[list[Any], WithJsonSchema(_POSES_SCHEMA)]
     skeleton: SkeletonField | None = Field(

@@ -189,7 +189,7 @@ def standing_pose() -> np.ndarray:
 
 
 def walking(num_frames: int = NUM_OBSERVED, *, fps: float = FPS, speed: float = 1.2) -> np.ndarray:
-    """(T, 21, 3) metres: a rigid person's stiff walk along +X that ends at time 0, arms and legs swinging."""
+    """(T, 21, 3) metres: a rigid person walks along +X until time 0, arms and legs swinging."""
     times = np.arange(1 - num_frames, 1) / fps
     poses = np.repeat(standing_pose()[None], num_frames, axis=0)
     poses[:, :, 0] += speed * times[:, None]

@@ -12,9 +12,11 @@ import numpy as np
 import torch
 import typer
 
-from models.bundle import BundleError, read_manifest
+from models.bundle import CARD_FILE, BundleError, read_manifest
 from models.motion.formats.errors import FormatError
+from models.motion.skeleton import SKELETONS
 from models.system import Recipe
+from service.errors import ServiceError
 from training.checkpoint import CheckpointError
 from training.contact_sheet import contact_sheet
 from training.data.batches import training_clips
@@ -38,6 +40,7 @@ ERRORS = (
     FormatError,
     PrepareError,
     RunError,
+    ServiceError,
     StoreError,
 )
 RecipeArgument = Annotated[
@@ -82,9 +85,13 @@ def load_recipe(path: str) -> Recipe:
 def prepare_command(
     sources: Annotated[list[Path], typer.Argument(help="Folders of BVH or AMC, or npz archives.")],
     out: Annotated[Path, typer.Option(help="Folder of the store.")],
+    skeleton: Annotated[str, typer.Option(help="A standard skeleton's name.")] = "body21",
+    fps: Annotated[float, typer.Option(help="Frames per second of the store.")] = 30.0,
 ) -> None:
     """Turn public motion files into a store, with a report of what was dropped and why."""
-    typer.echo(prepare(sources, out).table())
+    if skeleton not in SKELETONS:
+        raise StoreError(f"skeleton: found {skeleton!r}; must be one of {', '.join(SKELETONS)}.")
+    typer.echo(prepare(sources, out, skeleton=SKELETONS[skeleton], fps=fps).table())
 
 
 @app.command("train")
@@ -94,20 +101,32 @@ def train_command(
     out: Annotated[Path, typer.Option(help="Folder of the run; a killed run continues there.")],
     device: Annotated[str, typer.Option(help="cpu or cuda; the GPU if there is one.")] = "",
     seed: Annotated[int, typer.Option(help="Of weights, windows and noise.")] = 0,
+    start_from: Annotated[
+        Path | None, typer.Option(help="Folder of a finished run to take the weights of.")
+    ] = None,
 ) -> None:
     """Train every stage of a recipe."""
-    chosen = device or ("cuda" if torch.cuda.is_available() else "cpu")
-    train(load_recipe(recipe), open_store(store), out, device=torch.device(chosen), seed=seed)
+    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    train(
+        load_recipe(recipe),
+        open_store(store),
+        out,
+        device=chosen,
+        seed=seed,
+        start_from=start_from,
+    )
 
 
 @app.command("export")
 def export_command(
     recipe: RecipeArgument,
-    run: Annotated[Path, typer.Argument(help="Folder of the finished run.")],
     store: StoreOption,
     out: Annotated[Path, typer.Option(help="Folder of the bundle; its name names the bundle.")],
-    card: Annotated[Path, typer.Option(help="The model card, Markdown.")],
     licence: Annotated[str, typer.Option(help="Licence of the weights.")],
+    run: Annotated[Path | None, typer.Option(help="Folder of the finished run.")] = None,
+    card: Annotated[
+        Path | None, typer.Option(help="The model card; the one in the bundle's folder if none.")
+    ] = None,
     attribution: Annotated[list[str] | None, typer.Option(help="A text that users owe.")] = None,
     version: Annotated[str, typer.Option(help="Version of the bundle.")] = "1",
     machine: Annotated[str, typer.Option(help="What it was trained on, for the manifest.")] = "",
@@ -131,10 +150,16 @@ def export_command(
             attribution=tuple(attribution or ()),
             training=training if chosen.stages else {},
         ),
-        card=card.read_text(),
+        card=_card(card or out / CARD_FILE),
         observations=_some_observations(chosen, store),
     )
     typer.echo(f"{out}: {manifest.name} {manifest.version}, digest {manifest.digest}")
+
+
+def _card(path: Path) -> str:
+    if not path.is_file():
+        raise ExportError(f"{path}: found no model card; every bundle that ships carries one.")
+    return path.read_text()
 
 
 def _some_observations(recipe: Recipe, store: Path) -> np.ndarray:
@@ -160,7 +185,7 @@ def evaluate_command(
     seed: Annotated[int, typer.Option(help="Of the samples.")] = 0,
     sheet: Annotated[Path | None, typer.Option(help="Also draw ten windows to this PNG.")] = None,
 ) -> None:
-    """Measure bundles through the service's own engine, beside the baselines."""
+    """Measure bundles through the service's own engine, beside reference forecasts."""
     started = time.monotonic()
     opened = open_store(store)
     groups = dict(_group(text) for text in group)

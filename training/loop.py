@@ -1,6 +1,5 @@
 """The one training loop: every stage of every system."""
 
-import copy
 import json
 import math
 import time
@@ -50,9 +49,23 @@ class Run:
 
 
 def train(
-    recipe: Recipe, store: Store, folder: Path, *, device: torch.device, seed: int = 0
+    recipe: Recipe,
+    store: Store,
+    folder: Path,
+    *,
+    device: torch.device,
+    seed: int = 0,
+    start_from: Path | None = None,
 ) -> nn.Module:
     """Train all stages of a recipe, continuing the run in the folder if there is one.
+
+    Args:
+        recipe: what to train.
+        store: what to learn from.
+        folder: where checkpoints, TensorBoard's files and the recipe go.
+        device: where to compute.
+        seed: of weights, windows and noise.
+        start_from: folder of another run of the same network whose weights a new run starts with.
 
     Raises:
         RunError: the folder holds a run of another recipe.
@@ -70,6 +83,8 @@ def train(
     )
     _claim(run)
     state = load_checkpoint(folder, device) if (folder / CHECKPOINT_FILE).exists() else None
+    if start_from and not state:
+        run.network.load_state_dict(_weights_of(start_from, device))
     if state:
         run.network.load_state_dict(state["network"])
         run.progress.__init__(**state["progress"])  # type: ignore[misc]  # restored in place
@@ -83,13 +98,17 @@ def train(
     return run.network.eval()
 
 
-def trained_network(recipe: Recipe, folder: Path) -> tuple[nn.Module, Progress]:
-    """The network of a finished run, on the CPU.
+def trained_network(recipe: Recipe, folder: Path | None) -> tuple[nn.Module, Progress]:
+    """The network of a finished run, on the CPU; what needs no training needs no run.
 
     Raises:
         CheckpointError: there is no checkpoint.
         RunError: the run is of another recipe or is not finished.
     """
+    if not recipe.stages:
+        return recipe.build().eval(), Progress()
+    if folder is None:
+        raise RunError(f"run: {recipe.name} is trained; name the folder of its finished run.")
     state = load_checkpoint(folder, torch.device("cpu"))
     progress = Progress(**state["progress"])
     if progress.stage < len(recipe.stages):
@@ -100,6 +119,14 @@ def trained_network(recipe: Recipe, folder: Path) -> tuple[nn.Module, Progress]:
     network = recipe.build()
     network.load_state_dict(state["network"])
     return network.eval(), progress
+
+
+def _weights_of(folder: Path, device: torch.device) -> dict[str, Tensor]:
+    state = load_checkpoint(folder, device)
+    if "optimiser" in state:
+        raise RunError(f"{folder}: this run is not finished; a new run can start from a finished.")
+    weights: dict[str, Tensor] = state["network"]
+    return weights
 
 
 def _claim(run: Run) -> None:
@@ -178,14 +205,14 @@ def _optimiser(network: nn.Module, stage: Stage) -> torch.optim.Optimizer:
         }
         for name in stage.trains
     ]
-    return torch.optim.AdamW(groups, weight_decay=stage.weight_decay, amsgrad=stage.amsgrad)
+    return torch.optim.AdamW(
+        groups, weight_decay=stage.weight_decay, amsgrad=stage.amsgrad, fused=True
+    )
 
 
 def _set_rates(optimiser: torch.optim.Optimizer, stage: Stage, update: int) -> None:
     progress = update / stage.num_updates
-    factor = (
-        stage.decay(progress) if stage.decay else 0.5 + 0.5 * math.cos(math.pi * progress)
-    )
+    factor = stage.decay(progress) if stage.decay else 0.5 + 0.5 * math.cos(math.pi * progress)
     warm = min(1.0, (update + 1) / stage.warmup) if stage.warmup else 1.0
     for group in optimiser.param_groups:
         group["lr"] = group["rate"] * factor * warm
@@ -198,7 +225,7 @@ def _learn(
     stage: Stage,
 ) -> None:
     optimiser.zero_grad(set_to_none=True)
-    losses["total"].backward()  # type: ignore[no-untyped-call]  # torch's stub
+    losses["total"].backward()
     if stage.gradient_clip:
         nn.utils.clip_grad_norm_(learning, stage.gradient_clip)
     optimiser.step()
@@ -221,14 +248,12 @@ def _report(run: Run, stage: Stage, losses: Losses, bar: Any, writer: SummaryWri
         writer.add_scalar(f"{stage.name}/{name}", value, run.progress.update)
 
 
-def _save(
-    run: Run, optimiser: torch.optim.Optimizer | None, averaged: list[Tensor] | None
-) -> None:
-    progress = {name: getattr(run.progress, name) for name in Progress.__slots__}  # type: ignore[attr-defined]
-    state = {"network": run.network.state_dict(), "progress": progress}
+def _save(run: Run, optimiser: torch.optim.Optimizer | None, averaged: list[Tensor] | None) -> None:
+    progress = {name: getattr(run.progress, name) for name in Progress.__slots__}
+    state: dict[str, Any] = {"network": run.network.state_dict(), "progress": progress}
     if optimiser:
         state |= {"optimiser": optimiser.state_dict(), "averaged": averaged}
-    save_checkpoint(run.folder, copy.copy(state))
+    save_checkpoint(run.folder, state)
 
 
 def _on(device: torch.device, batch: Batch) -> Batch:

@@ -1,4 +1,4 @@
-"""What predictions are worth: the field's metrics, in float64 (definitions as in BeLFusion's code).
+"""What predictions are worth: the field's metrics, in float64 (Barquero et al. 2023).
 
 `ade`, `fde`, `apd`, `mmade`, `mmfde` and motion per frame look at joints relative to the root, the
 root itself dropped, a pose as one vector; `world_ade` and `world_fde` look at all joints in the

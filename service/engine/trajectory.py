@@ -1,6 +1,6 @@
 """The state of one sample on its way from noise to a future, and what goes into and out of it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -57,4 +57,10 @@ class Trajectory:
 
     def advanced(self, x_t: Float[np.ndarray, "..."]) -> "Trajectory":
         """The same sample one step later."""
-        return replace(self, x_t=x_t, steps_run=self.steps_run + 1)
+        return Trajectory(
+            request_id=self.request_id,
+            sample_index=self.sample_index,
+            num_steps=self.num_steps,
+            x_t=x_t,
+            steps_run=self.steps_run + 1,
+        )

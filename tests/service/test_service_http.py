@@ -1,12 +1,12 @@
 import numpy as np
 import orjson
 import pytest
-
 from in_memory import Service
+from tiny_bundles import walking
+
 from models.motion.kinematics import bone_lengths, rotate_yaw
 from models.motion.skeleton import BODY21, SKELETONS, joint_map
 from service.axes import Axes
-from tiny_bundles import walking
 
 WALK = walking()
 
@@ -186,7 +186,11 @@ def test_own_names_in_any_order_give_the_same_futures(service: Service):
     mapping = {f"j{i}_{joint}": joint for i, joint in enumerate(BODY21.joints)}
     options = {"seed": 4, "num_samples": 2}
     response = service.post(
-        {"poses": np.ascontiguousarray(WALK[:, order]), "skeleton": skeleton} | options
+        {
+            "poses": np.ascontiguousarray(WALK[:, order]),
+            "skeleton": {"joints": joints, "map": mapping},
+        }
+        | options
     )
     answer = orjson.loads(response.content)
     assert answer["joints"] == joints
@@ -255,3 +259,9 @@ def test_documents_declare_every_error(service: Service):
         media_type = "application/json" if status == "200" else "application/problem+json"
         assert media_type in response["content"]
     assert "Problem" in document["components"]["schemas"]
+
+
+def test_example_of_the_documents_works(service: Service):
+    document = service.get("/openapi.json").json()
+    (example,) = document["components"]["schemas"]["PredictRequest"]["examples"]
+    assert service.post(example).status_code == 200

@@ -4,10 +4,10 @@ from typing import Any
 import numpy as np
 import orjson
 import pytest
-
 from in_memory import JSON, Service, dumped
-from service.errors import ServiceError
 from tiny_bundles import walking
+
+from service.errors import ServiceError
 
 WALK = walking().tolist()
 
@@ -64,8 +64,8 @@ CASES = [
     ("invalid-poses", "/poses/3/11", fields(poses=replaced(3, 11, [0, 50, 0])), "a joint 50 m"),
     ("invalid-poses", "/poses", fields(poses=[[None] * 21] * 15), "no joint"),
     ("invalid-poses", "/poses", fields(poses=[[[0, 0, 0]] * 21] * 15), "a body 0 m across"),
-    ("invalid-poses", "/axes/units", fields(poses=scaled(1000)), "a body 1.65e+03 m across"),
-    ("invalid-poses", "/axes/units", fields(poses=scaled(100)), "a body 165 m across"),
+    ("invalid-poses", "/axes/units", fields(poses=scaled(1000)), "a body 1.64e+03 m across"),
+    ("invalid-poses", "/axes/units", fields(poses=scaled(100)), "a body 164 m across"),
     ("too-few-frames", "/poses", fields(poses=WALK[:14]), "14 frames at 30 fps"),
     ("too-few-frames", "/poses", fields(poses=[]), "0 frames at 30 fps"),
     ("too-few-frames", "/poses", fields(fps=60), "15 frames at 60 fps"),

@@ -46,12 +46,7 @@ def scale_bones(poses: Poses, factors: Float[np.ndarray, "B J"], parents: tuple[
 
 
 def augment(
-    poses: Poses,
-    *,
-    how: Augmentation,
-    skeleton: Skeleton,
-    num_observed: int,
-    generator: np.random.Generator,
+    poses: Poses, *, how: Augmentation, skeleton: Skeleton, generator: np.random.Generator
 ) -> Poses:
     """A varied copy of windows that already have their playing rate."""
     batch = len(poses)
@@ -63,14 +58,14 @@ def augment(
     if how.body_scale or how.bone_scale:
         factors = _bone_factors(batch, how, skeleton, generator)
         poses = scale_bones(poses, factors, skeleton.parents)
-    if how.observation_noise:
-        poses = poses.copy()
-        noise = generator.standard_normal((batch, num_observed, *poses.shape[2:]), np.float32)
-        noisy = generator.random((batch, 1, 1, 1)) < 0.5
-        poses[:, :num_observed] += noise * np.where(noisy, how.observation_noise, 0).astype(
-            np.float32
-        )
     return poses
+
+
+def add_sensor_noise(poses: Poses, *, deviation_m: float, generator: np.random.Generator) -> Poses:
+    """Windows of which every other one, by chance, has noise on each coordinate of each frame."""
+    noise = generator.standard_normal(poses.shape, np.float32)
+    noisy = generator.random((len(poses), 1, 1, 1)) < 0.5
+    return poses + noise * np.where(noisy, deviation_m, 0.0).astype(np.float32)
 
 
 def _bone_factors(

@@ -2,14 +2,14 @@
 
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from models.system import Data
-from training.data.augment import augment, warped_frames
+from training.data.augment import add_sensor_noise, augment, warped_frames
 from training.data.store import ClipRecord, Store, StoreError, select
 from training.data.windows import Windows
 
@@ -52,7 +52,7 @@ class Batches:
         )
 
     def batch(self, number: int, size: int) -> dict[str, Tensor]:
-        """Observation (B, T, J, 3) and future (B, H, J, 3) of batch number ``number``."""
+        """Batch number ``number``, as `models.system.Batch` describes it."""
         data, how = self._data, self._data.augmentation
         generator = np.random.default_rng([self._seed, number])
         drawn = self.windows.draw(size, generator)
@@ -71,16 +71,17 @@ class Batches:
             poses.astype(np.float32),
             how=how,
             skeleton=data.skeleton,
-            num_observed=data.num_observed,
             generator=generator,
         )
-        windows = torch.from_numpy(np.ascontiguousarray(poses))
+        observation = np.ascontiguousarray(poses[:, : data.num_observed])
+        seen = add_sensor_noise(observation, deviation_m=how.observation_noise, generator=generator)
         return {
-            "observation": windows[:, : data.num_observed],
-            "future": windows[:, data.num_observed :],
+            "observation": torch.from_numpy(observation),
+            "seen": torch.from_numpy(seen),
+            "future": torch.from_numpy(np.ascontiguousarray(poses[:, data.num_observed :])),
         }
 
-    def stream(self, *, first: int, size: int) -> Iterator[dict[str, Tensor]]:
+    def stream(self, *, first: int, size: int) -> Generator[dict[str, Tensor], None, None]:
         """Batches from number ``first`` on, made ahead by a thread."""
         ready: queue.Queue[dict[str, Tensor]] = queue.Queue(TAKEN_AHEAD)
         stop = threading.Event()

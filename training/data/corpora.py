@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from models.motion.formats.files import SUFFIXES, read_motion
+from models.motion.formats.files import read_motion
 from models.motion.formats.npz import Clip, read_archive
 from models.motion.motion import Motion
 
 VALID_SHARE = 0.08
+KINDS = (".npz", ".amc", ".bvh")
+"""In this order, so that where a take is found twice the one on the actor's own skeleton stays."""
 
 NAMES: tuple[tuple[str, str], ...] = (  # pattern of a file's stem, source
     (r"dataset-(?P<set>\d)_(?P<action>[^_]+)_(?P<style>[^_]+)_\d+", "bandai-{set}"),
@@ -25,10 +27,6 @@ NAMES: tuple[tuple[str, str], ...] = (  # pattern of a file's stem, source
     (r"0?(?P<subject>\d{2,3})_\d{2,3}", "cmu-{kind}"),  # BVH of CMU's takes are on other rigs
 )
 _PART = re.compile(r"(_part\d+)+$")
-
-
-class PrepareError(Exception):
-    """Nothing can be prepared from what was given."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -56,24 +54,6 @@ class Take:
     style: str = ""
     subject: str = ""
     floor: float | None = None
-
-
-def find_files(sources: tuple[Path, ...]) -> tuple[Path, ...]:
-    """The motion files among some files and folders, in a fixed order.
-
-    Raises:
-        PrepareError: a source is missing, or a folder holds no motion file.
-    """
-    found: list[Path] = []
-    for source in sources:
-        if not source.exists():
-            raise PrepareError(f"{source}: found nothing there; must be a motion file or a folder.")
-        inside = source.rglob("*") if source.is_dir() else (source,)
-        mine = sorted(path for path in inside if path.suffix.lower() in SUFFIXES)
-        if not mine:
-            raise PrepareError(f"{source}: found no file of the kinds {', '.join(SUFFIXES)}.")
-        found += mine
-    return tuple(found)
 
 
 def read_takes(path: Path) -> Iterator[Take]:

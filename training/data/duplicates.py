@@ -26,7 +26,7 @@ _FINE = (-0.5, -0.25, 0.0, 0.25, 0.5)
 _CLIPS_AT_ONCE, _WINDOWS_AT_ONCE = 128, 1 << 14
 _LIMBS = (("upper_leg", "lower_leg", "foot"), ("upper_arm", "lower_arm", "hand"))
 
-Angles = Float32[np.ndarray, "T 4"]
+Angles = Float32[np.ndarray, "_ 4"]
 
 
 def find_duplicates(
@@ -100,7 +100,7 @@ def _nearest_earlier(
         for clip, (where, phase) in zip(block, best, strict=True):
             other = int(np.searchsorted(starts, where, side="right")) - 1
             if other < clip:
-                near[clip] = (other, probes[clip] + phase - (where - int(starts[other])))
+                near[clip] = (other, float(probes[clip] + phase - (where - starts[other])))
     return near
 
 

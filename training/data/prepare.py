@@ -13,14 +13,7 @@ from models.motion.formats.errors import FormatError
 from models.motion.kinematics import rest_pose
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21, Skeleton, SkeletonError
-from training.data.corpora import (
-    GlitchLimits,
-    PrepareError,
-    Take,
-    find_files,
-    floor_height,
-    read_takes,
-)
+from training.data.corpora import KINDS, GlitchLimits, Take, floor_height, read_takes
 from training.data.duplicates import find_duplicates
 from training.data.glitches import clean_parts, glitch_steps
 from training.data.store import ClipRecord, Recording, write_store
@@ -28,6 +21,11 @@ from training.data.store import ClipRecord, Recording, write_store
 REPORT_FILE = "report.json"
 SHORTEST_S = 1.0
 ROTATION_ONE = 32767
+
+
+class PrepareError(Exception):
+    """Nothing can be prepared from what was given."""
+
 
 Prepared = tuple[ClipRecord, Recording]
 
@@ -109,10 +107,10 @@ def prepare(
                     (cut if clips else dropped).append(loss)
         except (FormatError, SkeletonError, OSError) as error:
             dropped.append(Loss(name=path.name, reason="unreadable", detail=str(error)))
-    kept, duplicates = _without_duplicates(prepared, skeleton, fps)
-    if not kept:
+    if not prepared:
         first = f"; the first: {dropped[0].detail}" if dropped else ""
         raise PrepareError(f"{out}: none of {len(dropped)} takes can be used{first}")
+    kept, duplicates = _without_duplicates(prepared, skeleton, fps)
     report = Report(
         fps=fps,
         kept=tuple(record for record, _ in kept),
@@ -121,6 +119,24 @@ def prepare(
     )
     write_store(out, skeleton=skeleton, fps=fps, clips=kept, files={REPORT_FILE: report.json()})
     return report
+
+
+def find_files(sources: tuple[Path, ...]) -> tuple[Path, ...]:
+    """The motion files among some files and folders, in a fixed order.
+
+    Raises:
+        PrepareError: a source is missing, or a folder holds no motion file.
+    """
+    found: list[Path] = []
+    for source in sources:
+        if not source.exists():
+            raise PrepareError(f"{source}: found nothing there; must be a motion file or a folder.")
+        inside = source.rglob("*") if source.is_dir() else (source,)
+        mine = [path for path in inside if path.suffix.lower() in KINDS]
+        if not mine:
+            raise PrepareError(f"{source}: found no file of the kinds {', '.join(KINDS)}.")
+        found += sorted(mine, key=lambda path: (KINDS.index(path.suffix.lower()), path))
+    return tuple(found)
 
 
 def _clips_of(

@@ -43,6 +43,4 @@ class ConstantVelocity(nn.Module):
 
 def graphs(network: nn.Module) -> tuple[Graph, ...]:
     """The decoder."""
-    return (
-        Graph(role="decoder", module=network, inputs=("observation",), outputs=("future",)),
-    )
+    return (Graph(role="decoder", module=network, inputs=("observation",), outputs=("future",)),)

@@ -24,7 +24,9 @@ def _untrained(name: str, description: str, module: type[nn.Module], **sizes: in
 
 def zero_velocity() -> Recipe:
     """Hold the last pose."""
-    return _untrained("zero_velocity", "The last observed pose, held for two seconds.", ZeroVelocity)
+    return _untrained(
+        "zero_velocity", "The last observed pose, held for two seconds.", ZeroVelocity
+    )
 
 
 def constant_velocity() -> Recipe:

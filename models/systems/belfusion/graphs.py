@@ -58,8 +58,8 @@ class Decoder(nn.Module):
         """Future poses in the world of the observation."""
         coupler, representation = self.network.coupler, self.network.representation
         offsets = coupler.offsets(self.network.latent_range.inverse(x0), target_code)
-        last = representation.enter(observation, observation[:, -1:])
-        return representation.leave(observation, last + coupler.frames(offsets))
+        target = representation.enter(observation, observation[:, -self.network.num_target :])
+        return representation.leave(observation, coupler.frames(offsets, target))
 
 
 def graphs(network: BeLFusion) -> tuple[Graph, ...]:

@@ -1,7 +1,7 @@
 """BeLFusion as one module of parts, and the losses of its three stages."""
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -9,30 +9,26 @@ from torch import Generator, Tensor, nn
 
 from models.diffusion import Schedule, q_sample
 from models.layers import Affine, reverse_gradient
+from models.pose import RootRelativePoses, WorldPoses
 from models.system import Batch, Losses
 
 RANGE_IN_DEVIATIONS = 3.0
 
 
-class Representation(Protocol):
-    """Poses to features and back, as in `models.pose`."""
-
-    num_features: int
-
-    def enter(self, observation: Tensor, poses: Tensor) -> Tensor:
-        """Features of poses."""
-
-    def leave(self, observation: Tensor, features: Tensor) -> Tensor:
-        """Poses of features."""
-
-
 class BeLFusion(nn.Module):
     """The six parts of the system (Barquero et al. 2023, Figs. 2 and 3)."""
 
-    def __init__(
+    # Either form's: `spectral` or `recurrent`, whose classes have the same methods.
+    behaviour_encoder: Any
+    coupler: Any
+    auxiliary: Any
+    observation: Any
+    denoiser: Any
+
+    def __init__(  # noqa: PLR0913 - one argument per part
         self,
         *,
-        representation: Representation,
+        representation: WorldPoses | RootRelativePoses,
         num_target: int,
         behaviour_encoder: nn.Module,
         coupler: nn.Module,
@@ -54,24 +50,24 @@ class BeLFusion(nn.Module):
         self.context_range = Affine(context)
 
     def features(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-        """Features of the observation, of x_m (its last frames) and of the future."""
-        seen = batch["observation"]
+        """Features of the observation as a sensor saw it, of x_m and of the future."""
+        clean, seen = batch["observation"], batch["seen"]
         observation = self.representation.enter(seen, seen)
-        future = self.representation.enter(seen, batch["future"])
-        return observation, observation[:, -self.num_target :], future
+        target = self.representation.enter(clean, clean[:, -self.num_target :])
+        return observation, target, self.representation.enter(clean, batch["future"])
 
     def context(self, observation: Float[Tensor, "B T F"]) -> Float[Tensor, "B C"]:
         """h(X) in the denoiser's range."""
         scaled: Tensor = self.context_range(self.observation.encode(observation))
         return scaled
 
-
     def future(
         self, z: Float[Tensor, "B D"], target: Float[Tensor, "B C F"]
     ) -> Float[Tensor, "B H F"]:
         """Features of the future that performs behaviour z from x_m on."""
         offsets = self.coupler.offsets(z, self.coupler.encode_target(target))
-        return target[:, -1:] + self.coupler.frames(offsets)
+        frames: Tensor = self.coupler.frames(offsets, target)
+        return frames
 
 
 def _squared(difference: Tensor) -> Tensor:
@@ -143,7 +139,7 @@ def observation_loss(network: BeLFusion, batch: Batch, generator: Generator) -> 
 def measure_ranges(
     network: BeLFusion, next_batch: Callable[[], Batch], *, num_batches: int
 ) -> None:
-    """Scale latents and contexts so that three standard deviations of the data become 1."""
+    """Scale latents and contexts so that three standard deviations of the widest become 1."""
     latents, contexts = [], []
     for _ in range(num_batches):
         observation, target, future = network.features(next_batch())
@@ -151,10 +147,11 @@ def measure_ranges(
         contexts.append(network.observation.encode(observation))
     for part, values in ((network.latent_range, latents), (network.context_range, contexts)):
         joined = torch.cat(values)
-        part.fit(joined.mean(dim=0), joined.std(dim=0) * RANGE_IN_DEVIATIONS)
+        widest = joined.std(dim=0).max() * RANGE_IN_DEVIATIONS
+        part.fit(joined.mean(dim=0), widest.expand(joined.shape[1]))
 
 
-def denoiser_loss(
+def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     network: BeLFusion,
     batch: Batch,
     generator: Generator,
@@ -162,6 +159,7 @@ def denoiser_loss(
     schedule: Schedule,
     num_candidates: int,
     reconstruction_weight: float,
+    noisiest_share: float = 0.0,
 ) -> Losses:
     """Eq. 6: of k candidates, the one nearest in latents and the one nearest in motion learn.
 
@@ -175,11 +173,10 @@ def denoiser_loss(
         code = network.coupler.encode_target(target)
         wanted = network.coupler.offsets(network.latent_range.inverse(z), code)
     timestep = torch.randint(schedule.num_steps, (rows,), generator=generator, device=device)
+    timestep[: round(noisiest_share * rows)] = schedule.num_steps - 1
     alpha_bar = torch.as_tensor(schedule.alpha_bar, dtype=z.dtype, device=device)[timestep]
     variance = torch.as_tensor(schedule.variance, dtype=z.dtype, device=device)[timestep]
-    noise = torch.randn(
-        (rows, num_candidates, z.shape[1]), generator=generator, device=device
-    )
+    noise = torch.randn((rows, num_candidates, z.shape[1]), generator=generator, device=device)
     x_t = q_sample(
         x0=z[:, None],
         noise=noise,
@@ -188,9 +185,7 @@ def denoiser_loss(
     )
     condition = network.denoiser.condition(network.context(observation))
     with torch.no_grad(), torch.autocast(device.type, dtype=torch.bfloat16):
-        near_latent, near_motion = _winners(
-            network, x_t, (timestep, condition, code), (z, wanted)
-        )
+        near_latent, near_motion = _winners(network, x_t, (timestep, condition, code), (z, wanted))
     row = torch.arange(rows, device=device)
     chosen = torch.cat([x_t[row, near_latent], x_t[row, near_motion]])
     x0 = network.denoiser(chosen, timestep.repeat(2), condition.repeat(2, 1))

@@ -1,5 +1,7 @@
 """The paper's recurrent parts (Barquero et al. 2023, supplement, section B)."""
 
+from itertools import pairwise
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -70,9 +72,11 @@ class RecurrentCoupler(nn.Module):
         frames = self.decoder(joined.flatten(0, -2))[:, self.num_target :]
         return frames.reshape(*joined.shape[:-1], -1)
 
-    def frames(self, offsets: Float[Tensor, "B HF"]) -> Float[Tensor, "B H F"]:
-        """Offsets frame by frame."""
-        return offsets.unflatten(1, (self.decoder.num_frames - self.num_target, -1))
+    def frames(
+        self, offsets: Float[Tensor, "B HF"], target: Float[Tensor, "B C F"]
+    ) -> Float[Tensor, "B H F"]:
+        """The future frame by frame."""
+        return target[:, -1:] + offsets.unflatten(1, (-1, target.shape[2]))
 
 
 class RecurrentObservationAutoencoder(nn.Module):
@@ -108,6 +112,6 @@ class RecurrentObservationAutoencoder(nn.Module):
 
 def _tanh_mlp(*widths: int) -> nn.Sequential:
     layers: list[nn.Module] = []
-    for narrow, wide in zip(widths[:-1], widths[1:], strict=True):
+    for narrow, wide in pairwise(widths):
         layers += [nn.Linear(narrow, wide), nn.Tanh()]
     return nn.Sequential(*layers[:-1])

@@ -6,6 +6,7 @@ auxiliary decoder r, observation encoder h, denoiser f.
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -13,101 +14,167 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models.layers import MLP
+from models.layers import MLP, Affine
 from models.pose import continuation_basis, cosine_basis
 from models.system import Batch
 
 LOG_VARIANCE_LIMIT = 10.0
+INPUT_LIMIT = 8.0
 
 
-class SpectralBehaviourEncoder(nn.Module):
-    """p(z | x_m, Y): the future's offsets in the continuation basis, through an MLP."""
+class Continuation(nn.Module):
+    """Where the last observed frames point, and the basis in which futures deviate from there.
+
+    The expectation is one linear filter per feature, fitted by least squares; the basis is zero
+    at the last observed frame. So whatever the latent, a future starts at the last pose with
+    the last velocity.
+    """
 
     basis: Tensor
+    filter: Tensor
 
-    def __init__(
-        self, *, features: int, num_target: int, horizon: int, latent: int, hidden: int, bases: int
-    ) -> None:
+    def __init__(self, *, features: int, num_target: int, horizon: int, bases: int) -> None:
         super().__init__()
+        self.bases = bases
         self.register_buffer("basis", continuation_basis(bases, horizon), persistent=False)
-        self.principal = nn.Linear(bases * features, latent)
-        self.network = MLP((num_target + bases) * features, hidden, hidden, 2 * latent)
-        _start_from_zero(self.network)
+        self.register_buffer("filter", torch.zeros(features, horizon, num_target - 1))
+
+    def expected(self, target: Float[Tensor, "B C F"]) -> Float[Tensor, "B H F"]:
+        """The future if nothing but the last frames counted."""
+        steps = (target[:, :-1] - target[:, -1:]).permute(2, 1, 0)  # (F, C - 1, B)
+        return target[:, -1:] + torch.matmul(self.filter, steps).permute(2, 1, 0)
 
     def spectrum(
         self, target: Float[Tensor, "B C F"], future: Float[Tensor, "B H F"]
     ) -> Float[Tensor, "B KF"]:
-        """Coefficients of the future's offsets from the last observed pose."""
-        return torch.einsum("hk,bhf->bkf", self.basis, future - target[:, -1:]).flatten(1)
+        """Coefficients of what sets the future apart from the expected one."""
+        return torch.matmul(self.basis.T, future - self.expected(target)).flatten(1)
+
+    def frames(
+        self, spectrum: Float[Tensor, "B KF"], target: Float[Tensor, "B C F"]
+    ) -> Float[Tensor, "B H F"]:
+        """Inverse of `spectrum`."""
+        deviation = torch.matmul(self.basis, spectrum.unflatten(1, (self.bases, -1)))
+        return self.expected(target) + deviation
+
+
+class SpectralBehaviourEncoder(nn.Module):
+    """p(z | x_m, Y): principal components of the future's spectrum, corrected by an MLP."""
+
+    def __init__(
+        self,
+        continuation: Continuation,
+        *,
+        features: int,
+        num_target: int,
+        latent: int,
+        hidden: int,
+    ) -> None:
+        super().__init__()
+        self.continuation = continuation
+        coefficients = continuation.bases * features
+        self.principal = nn.Linear(coefficients, latent)
+        self.network = MLP(num_target * features + coefficients, hidden, hidden, 2 * latent)
+        _start_from_zero(self.network)
 
     def forward(
         self, target: Float[Tensor, "B C F"], future: Float[Tensor, "B H F"]
     ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
         """Mean and log variance of the behaviour's posterior."""
-        last = target[:, -1:]
-        spectrum = self.spectrum(target, future)
-        joined = torch.cat([(target[:, :-1] - last).flatten(1), last.flatten(1)], dim=1)
-        mean, log_variance = self.network(torch.cat([joined, spectrum], dim=1)).chunk(2, dim=1)
-        log_variance = (log_variance - 6.0).clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
+        spectrum = self.continuation.spectrum(target, future)
+        seen = torch.cat([_posture_and_steps(target), spectrum], dim=1)
+        mean, log_variance = self.network(seen).chunk(2, dim=1)
+        log_variance = (log_variance - 8.0).clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
         return mean + self.principal(spectrum), log_variance
 
 
 class SpectralCoupler(nn.Module):
-    """B(z, g(x_m)): offsets from the last observed pose, as coefficients of the basis.
-
-    The basis is zero at the last observed frame, so no latent can make the first frame jump.
-    """
-
-    basis: Tensor
+    """B(z, g(x_m)): the future's spectrum, principal components corrected by an MLP."""
 
     def __init__(
-        self, *, features: int, num_target: int, horizon: int, latent: int, hidden: int, bases: int
+        self,
+        continuation: Continuation,
+        *,
+        features: int,
+        num_target: int,
+        latent: int,
+        hidden: int,
     ) -> None:
         super().__init__()
-        self.shape = (bases, features)
-        self.register_buffer("basis", continuation_basis(bases, horizon), persistent=False)
+        self.continuation = continuation
+        coefficients = continuation.bases * features
         self.target_encoder = nn.Linear(num_target * features, latent)
-        self.principal = nn.Linear(latent, bases * features)
-        self.network = MLP(2 * latent, hidden, hidden, bases * features)
+        self.principal = nn.Linear(latent, coefficients)
+        self.network = MLP(2 * latent, hidden, hidden, coefficients)
         _start_from_zero(self.network)
 
     def encode_target(self, target: Float[Tensor, "B C F"]) -> Float[Tensor, "B G"]:
         """g(x_m)."""
-        last = target[:, -1:]
-        joined = torch.cat([(target[:, :-1] - last).flatten(1) * 10, last.flatten(1)], dim=1)
-        return self.target_encoder(joined)
+        code: Tensor = self.target_encoder(_posture_and_steps(target))
+        return code
 
     def offsets(
         self, z: Float[Tensor, "*B D"], code: Float[Tensor, "*B G"]
     ) -> Float[Tensor, "*B KF"]:
-        """Coefficients of the offsets; the basis is orthonormal, so distances equal the motion's."""
-        coefficients: Tensor = self.principal(z) + self.network(torch.cat([z, code], dim=-1))
-        return coefficients
+        """The spectrum; its basis is orthonormal, so distances equal those of the motions."""
+        spectrum: Tensor = self.principal(z) + self.network(torch.cat([z, code], dim=-1))
+        return spectrum
 
-    def frames(self, offsets: Float[Tensor, "B KF"]) -> Float[Tensor, "B H F"]:
-        """Offsets frame by frame."""
-        return torch.matmul(self.basis, offsets.unflatten(1, self.shape))
+    def frames(
+        self, offsets: Float[Tensor, "B KF"], target: Float[Tensor, "B C F"]
+    ) -> Float[Tensor, "B H F"]:
+        """The future frame by frame."""
+        return self.continuation.frames(offsets, target)
+
+
+def _posture_and_steps(target: Float[Tensor, "B C F"]) -> Float[Tensor, "B CF"]:
+    # Steps from frame to frame are centimetres; ten times as much puts them on a pose's scale.
+    steps = (target[:, 1:] - target[:, :-1]) * 10
+    return torch.cat([steps.flatten(1), target[:, -1]], dim=1)
 
 
 @torch.no_grad()
-def fit_principal_components(
-    network: Any, next_batch: Callable[[], Batch], *, num_batches: int
+def fit_linear_parts(
+    network: Any,
+    next_batch: Callable[[], Batch],
+    *,
+    num_batches: int,
+    noise_m: float,
+    whitening: float,
 ) -> None:
-    """Start behaviour encoder and coupler as the principal components of the offsets, whitened.
+    """Fit the expectation's filter, then start encoder and coupler as principal components.
 
-    The networks beside them then only learn what a linear code cannot say, which spares most of
-    the updates that the autoencoder would need from scratch.
+    The networks beside them only learn what a linear code cannot say, which spares most of the
+    updates that an autoencoder needs from scratch.
+
+    Args:
+        network: a BeLFusion of spectral parts.
+        next_batch: source of batches.
+        num_batches: how many of them to fit to.
+        noise_m: the sensor noise that the filter must bear (its ridge).
+        whitening: 1 gives every latent the same variance, 0 that of its motion in metres; between
+            them, what moves the body most is also what the noise of the diffusion hides last.
     """
     encoder, coupler = network.behaviour_encoder, network.coupler
-    batches = (network.features(next_batch()) for _ in range(num_batches))
-    spectra = torch.cat([encoder.spectrum(target, future) for _, target, future in batches])
+    continuation = coupler.continuation
+    pairs = [network.features(next_batch())[1:] for _ in range(num_batches)]
+    target = torch.cat([pair[0] for pair in pairs])
+    future = torch.cat([pair[1] for pair in pairs])
+    steps = (target[:, :-1] - target[:, -1:]).permute(2, 0, 1).double()  # (F, B, C - 1)
+    moved = (future - target[:, -1:]).permute(2, 0, 1).double()
+    # Noise of every frame, that of the last one shared by all steps.
+    ridge = len(target) * noise_m**2 * (torch.eye(steps.shape[2]).to(steps) + 1)
+    filter_t = torch.linalg.solve(steps.mT @ steps + ridge, steps.mT @ moved)
+    continuation.filter.copy_(filter_t.mT)
+    spectra = continuation.spectrum(target, future)
     mean = spectra.mean(dim=0)
     values, vectors = torch.linalg.eigh(torch.cov((spectra - mean).T.double()))
     latent = encoder.principal.out_features
-    vectors, deviation = vectors[:, -latent:].float(), values[-latent:].clamp(min=1e-10).sqrt()
-    encoder.principal.weight.copy_((vectors / deviation.float()).T)
-    encoder.principal.bias.copy_(-(mean @ vectors) / deviation.float())
-    coupler.principal.weight.copy_(vectors * deviation.float())
+    vectors = vectors[:, -latent:].to(spectra)
+    scale = values[-latent:].clamp(min=1e-10).sqrt().to(spectra) ** whitening
+    encoder.principal.weight.copy_((vectors / scale).T)
+    encoder.principal.bias.copy_(-(mean @ vectors) / scale)
+    coupler.principal.weight.copy_(vectors * scale)
     coupler.principal.bias.copy_(mean)
 
 
@@ -135,31 +202,48 @@ class SpectralAuxiliaryDecoder(nn.Module):
 
 
 class SpectralObservationAutoencoder(nn.Module):
-    """h: the observation's cosine spectrum through an MLP, and a decoder that pre-trains it."""
+    """h: the last pose and the cosine spectrum of what led to it, through an MLP.
+
+    The decoder only serves to pre-train the encoder.
+    """
 
     basis: Tensor
 
-    def __init__(
-        self, *, features: int, num_observed: int, context: int, hidden: int
-    ) -> None:
+    def __init__(self, *, features: int, num_observed: int, context: int, hidden: int) -> None:
         super().__init__()
         self.shape = (num_observed, features)
-        # Differences to the last frame and the frame itself are what a forecast needs; the
-        # spectrum of the former separates motion from sensor noise.
         self.register_buffer("basis", cosine_basis(num_observed, num_observed), persistent=False)
+        self.inputs = Affine((num_observed + 1) * features)
         self.encoder = MLP((num_observed + 1) * features, hidden, hidden, context)
         self.decoder = MLP(context, hidden, num_observed * features)
 
+    def spectrum(self, observation: Float[Tensor, "B T F"]) -> Float[Tensor, "B N"]:
+        """The last pose, and the coefficients of the differences from it."""
+        last = observation[:, -1:]
+        coefficients = torch.matmul(self.basis.T, observation - last)
+        return torch.cat([last, coefficients], dim=1).flatten(1)
+
     def encode(self, observation: Float[Tensor, "B T F"]) -> Float[Tensor, "B C"]:
         """The context c = h(X)."""
-        last = observation[:, -1]
-        spectrum = torch.einsum("tk,btf->bkf", self.basis, observation - last[:, None])
-        context: Tensor = self.encoder(torch.cat([last, spectrum.flatten(1)], dim=1))
+        # Fine motion is millimetres where a pose is decimetres; both count alike.
+        scaled = self.inputs(self.spectrum(observation))
+        context: Tensor = self.encoder(scaled.clamp(-INPUT_LIMIT, INPUT_LIMIT))
         return context
 
     def forward(self, observation: Float[Tensor, "B T F"]) -> Float[Tensor, "B T F"]:
         """The observation, reconstructed from its context."""
         return self.decoder(self.encode(observation)).unflatten(1, self.shape)
+
+
+@torch.no_grad()
+def fit_observation_inputs(
+    network: Any, next_batch: Callable[[], Batch], *, num_batches: int
+) -> None:
+    """Give every input of the observation encoder mean 0 and deviation 1 over some batches."""
+    part = network.observation
+    observations = (network.features(next_batch())[0] for _ in range(num_batches))
+    spectra = torch.cat([part.spectrum(observation) for observation in observations])
+    part.inputs.fit(spectra.mean(dim=0), spectra.std(dim=0))
 
 
 class DenseBlock(nn.Module):
@@ -198,9 +282,7 @@ class DenseUNet(nn.Module):
         self.stem = nn.Linear(latent, widths[0])
         blocks = [(w, w) for w in widths]
         rising = list(zip(widths[-2::-1], widths[:0:-1], strict=True))
-        self.down = nn.ModuleList(
-            nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)
-        )
+        self.down = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         self.falling = nn.ModuleList(DenseBlock(*b) for b in blocks)
         self.middle = DenseBlock(widths[-1], widths[-1])
         self.rising = nn.ModuleList(DenseBlock(wide + low, wide) for wide, low in rising)

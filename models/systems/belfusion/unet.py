@@ -125,9 +125,7 @@ class PictureUNet(nn.Module):
         for level, multiplier in reversed(list(enumerate(multipliers))):
             wide = base * multiplier
             for last in (False, True):
-                parts: list[nn.Module] = [
-                    ResidualBlock(channels + skipped.pop(), wide, embedding)
-                ]
+                parts: list[nn.Module] = [ResidualBlock(channels + skipped.pop(), wide, embedding)]
                 channels = wide
                 if level >= attention_from:
                     parts.append(SelfAttention(wide))

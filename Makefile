@@ -1,0 +1,55 @@
+# make serve        start the server with the bundled models, on port 8000 or on PORT
+# make test         run every check and every test
+# make lint         run the checks alone
+# make format       rewrite the code as `make lint` wants it
+# make benchmarks   run tests/benchmarks
+# make clean        remove caches and build outputs; keeps .venv, runs and stores
+
+PYTHON ?= python3
+PORT ?= 8000
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
+
+.PHONY: serve test lint format benchmarks clean
+
+serve: $(VENV)/.core
+	@$(BIN)/posefutures serve --port $(PORT)
+
+test: lint
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/.dev
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+benchmarks: $(VENV)/.dev
+	@set -e; for file in tests/benchmarks/[!_]*.py; do echo "$$file"; $(BIN)/python "$$file"; done
+
+clean:
+	rm -rf build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find models service training tests -name __pycache__ -prune -exec rm -rf {} +
+
+# One .venv: the dev install holds all of the core install, so it stamps both.
+$(VENV)/.core: pyproject.toml | $(BIN)/python
+	@echo "installing the server into $(VENV)"
+	@$(PIP_INSTALL) --editable .
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml | $(BIN)/python
+	@echo "installing the server, PyTorch and the development tools into $(VENV)"
+	@$(PIP_INSTALL) --editable '.[dev]'
+	@touch $(VENV)/.core $@
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+		echo "PYTHON=$(PYTHON): found $$($(PYTHON) --version 2>&1);" \
+			"must be Python 3.11 or newer, such as make PYTHON=python3.12" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)

@@ -1,0 +1,170 @@
+import json
+import shutil
+from pathlib import Path
+from threading import Event
+
+import pytest
+from in_memory import Service
+from tiny_bundles import FUTURE, HORIZON, OBSERVATION, LastPose, exported, walking, write
+
+from models.bundle import read_manifest
+from service.app import create_app
+from service.catalog import Catalog
+from service.errors import UnknownModelError
+from service.settings import Settings
+
+BODY = {"poses": walking(), "num_samples": 1}
+
+
+@pytest.fixture
+def copies(bundles: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(bundles, tmp_path / "copies")
+
+
+def flip_bit(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def test_flipped_bit_refuses_its_bundle_and_no_other(
+    copies: Path, caplog: pytest.LogCaptureFixture
+):
+    flip_bit(copies / "still" / "decoder.onnx")
+    with Service.of(copies) as service:
+        service.wait_until_loaded()
+        assert service.post(BODY).status_code == 200
+        refused = service.post({**BODY, "model": "still"})
+        assert refused.status_code == 503
+        assert refused.json()["type"] == "/problems/unavailable"
+        assert "still/decoder.onnx: found sha256" in refused.json()["detail"]
+        assert str(copies) not in refused.text
+        ready = service.get("/readyz")
+        assert ready.status_code == 200
+        assert ready.json()["models"]["still"].startswith("refused: still/decoder.onnx")
+        assert service.get("/models/still").json()["state"] == "refused"
+    assert "bundle still is refused: still/decoder.onnx" in caplog.text
+
+
+def break_manifest(folder: Path) -> None:
+    (folder / "manifest.json").write_text("{")
+
+
+def remove_manifest(folder: Path) -> None:
+    (folder / "manifest.json").unlink()
+
+
+def remove_graph(folder: Path) -> None:
+    (folder / "decoder.onnx").unlink()
+
+
+def rename(folder: Path) -> None:
+    manifest = folder / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"still"', '"stiller"'))
+
+
+def swap_schedule(folder: Path) -> None:
+    shutil.rmtree(folder)
+    shutil.copytree(folder.parent / "diffusion", folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["name"] = "still"
+    manifest["schedule"]["alpha_bar"].reverse()
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def make_manifest_a_folder(folder: Path) -> None:
+    (folder / "manifest.json").unlink()
+    (folder / "manifest.json").mkdir()
+
+
+def answer_nan(folder: Path) -> None:
+    class Nan(LastPose):
+        def forward(self, observation):
+            return super().forward(observation) * (observation[:, :1, :1] * 0.0).log().log()
+
+    graph = exported(Nan(), "decoder.onnx", inputs=(OBSERVATION,), outputs=(FUTURE,))
+    write(folder, {"decoder": graph})
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (break_manifest, "still/manifest.json"),
+        (remove_manifest, "still: found no manifest.json"),
+        (remove_graph, "still/decoder.onnx: the file is missing"),
+        (swap_schedule, "alpha_bar: must fall"),
+        (make_manifest_a_folder, "still: found no manifest.json"),
+        (rename, "name: found 'stiller'"),
+        (answer_nan, "still: the decoder gave NaN"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_damaged_bundle_is_refused_with_its_reason(copies: Path, damage, reason: str):
+    damage(copies / "still")
+    catalog = Catalog(copies, default_model=None, threads=1)
+    catalog.load()
+    catalog.stop()
+    assert catalog.entries["diffusion"].state == "ready"
+    assert catalog.entries["still"].state == "refused"
+    assert reason in (catalog.entries["still"].reason or "")
+
+
+def test_default_is_the_setting_or_the_file_or_the_first(copies: Path):
+    def default(name: str | None = None) -> str | None:
+        return Catalog(copies, default_model=name, threads=1).default_model
+
+    assert default("still") == "still"
+    (copies / "DEFAULT").write_text("still\n")
+    assert default() == "still"
+    (copies / "DEFAULT").unlink()
+    assert default() == "diffusion"
+    with pytest.raises(UnknownModelError, match="must be one of diffusion, still"):
+        default("oracle")
+
+
+@pytest.mark.parametrize("folder", ["empty", "missing"])
+def test_server_without_bundles_is_alive_and_not_ready(tmp_path: Path, folder: str):
+    (tmp_path / "empty").mkdir()
+    with Service.of(tmp_path / folder) as service:
+        assert service.get("/livez").status_code == 200
+        assert service.get("/readyz").status_code == 503
+        response = service.post(BODY)
+        assert response.status_code == 503
+        assert "no bundle" in response.json()["detail"]
+
+
+def test_only_loading_makes_a_server_unready(bundles: Path, monkeypatch: pytest.MonkeyPatch):
+    may_load = Event()
+    load = Catalog.load
+
+    def held(catalog: Catalog) -> None:
+        may_load.wait()
+        load(catalog)
+
+    monkeypatch.setattr(Catalog, "load", held)
+    with Service.of(bundles) as service:
+        assert service.get("/livez").status_code == 200
+        ready = service.get("/readyz")
+        assert (ready.status_code, ready.json()["status"]) == (503, "loading")
+        early = service.post(BODY)
+        assert (early.status_code, early.json()["type"]) == (503, "/problems/unavailable")
+        assert early.headers["retry-after"] == "1"
+        may_load.set()
+        service.wait_until_loaded()
+        assert service.get("/readyz").status_code == 200
+        assert service.post(BODY).status_code == 200
+
+
+def test_settings_come_from_the_environment(bundles: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("POSEFUTURES_BUNDLES", str(bundles))
+    monkeypatch.setenv("POSEFUTURES_DEFAULT_MODEL", "still")
+    monkeypatch.setenv("POSEFUTURES_MAX_SAMPLES", "7")
+    app = create_app()
+    assert app.state.catalog.default_model == "still"
+    assert app.state.settings.max_samples == 7
+    monkeypatch.delenv("POSEFUTURES_BUNDLES")
+    assert Settings().bundles.name == "bundles"
+
+
+def test_bundle_of_a_test_has_the_horizon_it_says(bundles: Path):
+    assert read_manifest(bundles / "still").horizon == HORIZON

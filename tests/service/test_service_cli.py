@@ -1,0 +1,107 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from tiny_bundles import walking
+from typer.testing import CliRunner, Result
+
+from models.motion.formats.bvh import read_bvh, write_bvh
+from models.motion.kinematics import bone_lengths
+from models.motion.motion import Motion
+from models.motion.skeleton import BODY21
+from service.cli import app
+
+
+@pytest.fixture(autouse=True)
+def environment(bundles: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POSEFUTURES_BUNDLES", str(bundles))
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Path:
+    file = tmp_path / "walk.bvh"
+    write_bvh(file, Motion(name="walk", skeleton=BODY21, positions=walking(40), fps=30.0))
+    return file
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def one_line(result: Result) -> str:
+    assert result.exit_code == 2, result.output
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("posefutures: ")
+    return result.stderr
+
+
+def test_predict_writes_bvh_in_the_skeleton_and_rate_of_the_file(walk: Path, tmp_path: Path):
+    result = run("predict", walk, "--num-samples", "3", "--seed", "1", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    written = sorted((tmp_path / "out").glob("*.bvh"))
+    assert [path.name for path in written] == [f"walk-future-{i}.bvh" for i in range(3)]
+    observed, future = read_bvh(walk), read_bvh(written[0])
+    assert future.skeleton.joints == observed.skeleton.joints
+    assert future.fps == pytest.approx(30.0)
+    assert future.num_frames == 60
+    assert np.abs(future.positions[0] - observed.positions[-1]).max() < 0.1
+    lengths = bone_lengths(future.positions, BODY21.parents)
+    expected = bone_lengths(observed.positions[-1], BODY21.parents)
+    np.testing.assert_allclose(lengths, np.broadcast_to(expected, lengths.shape), atol=1e-3)
+
+
+def test_predict_writes_npz_from_any_second(walk: Path, tmp_path: Path):
+    result = run("predict", walk, "--format", "npz", "--at", "1.0", "--out", tmp_path,
+                 "--model", "still", "--num-samples", "2")  # fmt: skip
+    assert result.exit_code == 0, result.output
+    with np.load(tmp_path / "walk-futures.npz") as archive:
+        assert archive["futures"].shape == (2, 60, 21, 3)
+        np.testing.assert_allclose(
+            archive["futures"][0, 0], read_bvh(walk).positions[30], atol=1e-3
+        )
+        assert tuple(archive["joints"]) == BODY21.joints
+
+
+def test_same_seed_writes_the_same_files(walk: Path, tmp_path: Path):
+    for out in ("a", "b"):
+        run("predict", walk, "--seed", "9", "--num-samples", "1", "--out", tmp_path / out)
+    names = ("a/walk-future-0.bvh", "b/walk-future-0.bvh")
+    first, second = ((tmp_path / name).read_bytes() for name in names)
+    assert first == second
+
+
+def test_file_cut_in_the_middle_is_one_line(walk: Path):
+    text = walk.read_text()
+    walk.write_text(text[: len(text) * 2 // 3])
+    assert "walk.bvh" in one_line(run("predict", walk))
+
+
+def test_other_mistakes_are_one_line(walk: Path, tmp_path: Path):
+    assert "nowhere.bvh" in one_line(run("predict", tmp_path / "nowhere.bvh"))
+    assert "must be one of diffusion, still" in one_line(run("predict", walk, "--model", "oracle"))
+    assert "at: found 9 s" in one_line(run("predict", walk, "--at", "9"))
+    assert "num_steps: found 99" in one_line(run("predict", walk, "--num-steps", "99"))
+
+
+def test_bad_setting_is_one_line(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("POSEFUTURES_THREADS", "many")
+    assert "POSEFUTURES_THREADS: found 'many'" in one_line(run("models"))
+
+
+def test_models_are_listed_with_the_default_marked():
+    lines = run("models").stdout.splitlines()
+    assert lines[0].startswith("* diffusion")
+    assert lines[1].startswith("  still")
+
+
+def test_flags_are_frozen():
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    flags = {name: [p.name for p in command.params] for name, command in commands.items()}
+    assert flags == {
+        "serve": ["host", "port"],
+        "models": [],
+        "predict": [
+            "file", "num_samples", "num_steps", "model", "seed", "out", "output_format", "at",
+        ],
+    }  # fmt: skip
