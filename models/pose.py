@@ -34,30 +34,20 @@ class Frame:
         across = left - right
         length = across[:, :2].square().sum(dim=-1, keepdim=True).add(1e-12).sqrt()
         unit = across[:, :2] / length  # a person who faces +X has the left side at +Y
+        cos, sin, zero, one = unit[:, 1], -unit[:, 0], 0 * unit[:, 0], 0 * unit[:, 0] + 1
         self.origin = last[:, :1].unsqueeze(1)  # (B, 1, 1, 3)
-        self.cos = unit[:, 1].reshape(-1, 1, 1)
-        self.sin = -unit[:, 0].reshape(-1, 1, 1)
+        turn = [cos, -sin, zero, sin, cos, zero, zero, zero, one]
+        self.turn = torch.stack(turn, dim=1).unflatten(1, (3, 3))
 
     def enter(self, world: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
         """Poses of the world in the canonical frame."""
-        x, y, z = (world - self.origin).unbind(dim=-1)
-        return torch.stack([self.cos * x + self.sin * y, self.cos * y - self.sin * x, z], dim=-1)
+        turned = torch.matmul((world - self.origin).flatten(1, 2), self.turn)
+        return turned.unflatten(1, world.shape[1:3])
 
     def leave(self, canonical: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
         """Poses of the canonical frame in the world."""
-        x, y, z = canonical.unbind(dim=-1)
-        turned = torch.stack([self.cos * x - self.sin * y, self.cos * y + self.sin * x, z], dim=-1)
-        return turned + self.origin
-
-
-def relative_to_root(poses: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
-    """Joints relative to the root of their frame; the root's own row keeps its path."""
-    return torch.cat([poses[:, :, :1], poses[:, :, 1:] - poses[:, :, :1]], dim=2)
-
-
-def with_root(relative: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
-    """Inverse of `relative_to_root`."""
-    return torch.cat([relative[:, :, :1], relative[:, :, 1:] + relative[:, :, :1]], dim=2)
+        turned = torch.matmul(canonical.flatten(1, 2), self.turn.transpose(1, 2))
+        return turned.unflatten(1, canonical.shape[1:3]) + self.origin
 
 
 def continuation_basis(num_bases: int, length: int) -> Float[Tensor, "length num_bases"]:
@@ -91,24 +81,26 @@ class WorldPoses:
     def __init__(self, skeleton: Skeleton, *, root_weight: float) -> None:
         self.num_features = 3 * skeleton.num_joints
         self._pairs = facing(skeleton)
-        self._root_weight = root_weight
+        # Rows in, columns out: one small product takes the place of slices and sums.
+        mixing = torch.eye(skeleton.num_joints)
+        mixing[0, 1:] = -1
+        mixing[0, 0] = root_weight
+        self._to_features = torch.kron(mixing, torch.eye(3))
+        self._to_poses = torch.linalg.inv(self._to_features.double()).float()
 
     def enter(
         self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B L J 3"]
     ) -> Float[Tensor, "B L F"]:
         """Features of poses of the observation's world."""
-        relative = relative_to_root(Frame(observation, self._pairs).enter(poses))
-        root, joints = relative[:, :, :1] * self._root_weight, relative[:, :, 1:]
-        return torch.cat([root, joints], dim=2).flatten(2)
+        canonical = Frame(observation, self._pairs).enter(poses).flatten(2)
+        return torch.matmul(canonical, self._to_features.to(canonical.device))
 
     def leave(
         self, observation: Float[Tensor, "B T J 3"], features: Float[Tensor, "B L F"]
     ) -> Float[Tensor, "B L J 3"]:
         """Poses in the observation's world."""
-        joints = features.unflatten(2, (-1, 3))
-        root = joints[:, :, :1] / self._root_weight
-        canonical = with_root(torch.cat([root, joints[:, :, 1:]], dim=2))
-        return Frame(observation, self._pairs).leave(canonical)
+        canonical = torch.matmul(features, self._to_poses.to(features.device))
+        return Frame(observation, self._pairs).leave(canonical.unflatten(2, (-1, 3)))
 
 
 class RootRelativePoses:

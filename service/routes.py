@@ -47,32 +47,22 @@ def _settings(request: Request) -> Settings:
 _Catalog = Annotated[Catalog, Depends(_catalog)]
 _Settings = Annotated[Settings, Depends(_settings)]
 
+_PROBLEMS = declared(
+    MalformedBodyError, BodyTooLargeError, MediaTypeError, FieldError, EngineError, UnavailableError
+)
+
 
 @router.post(
     "/v1/predict",
     operation_id="predict_v1",
     response_model=schemas.PredictResponse,
-    responses=declared(
-        MalformedBodyError,
-        BodyTooLargeError,
-        MediaTypeError,
-        FieldError,
-        EngineError,
-        UnavailableError,
-    ),
+    responses=_PROBLEMS,
 )
 @router.post(
     "/predict",
     operation_id="predict",
     response_model=schemas.PredictResponse,
-    responses=declared(
-        MalformedBodyError,
-        BodyTooLargeError,
-        MediaTypeError,
-        FieldError,
-        EngineError,
-        UnavailableError,
-    ),
+    responses=_PROBLEMS,
 )
 async def predict(body: schemas.PredictRequest, catalog: _Catalog, settings: _Settings) -> Response:
     """N futures of the person in the poses, in the caller's world, skeleton and frame rate."""

@@ -1,6 +1,7 @@
 """Stick figures of a bundle's futures, to look at: one PNG."""
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from PIL import Image
 
 from models.bundle import read_manifest
 from models.motion.kinematics import rotate_yaw, yaw
@@ -21,6 +23,7 @@ from training.data.windows import Windows, cut
 from training.predictors import BundlePredictor
 
 NUM_WINDOWS, NUM_SAMPLES, NUM_TIMES = 10, 3, 5
+PALETTE = 32
 STILL_M, SPREAD_M = 0.5, 0.7  # who moves less is drawn once more at every time, so far apart
 NEAR, FAR = "tab:blue", "tab:orange"  # the left and the right side of the body
 
@@ -66,7 +69,10 @@ def contact_sheet(
         axes.set_title(title, fontsize=9)
     out.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
-    figure.savefig(out, dpi=72, pil_kwargs={"optimize": True})
+    buffer = BytesIO()
+    figure.savefig(buffer, dpi=72)
+    # A palette keeps the file small enough to be committed.
+    Image.open(buffer).convert("RGB").quantize(PALETTE).save(out, optimize=True)
 
 
 def _spread(windows: Windows, actions: Sequence[str]) -> Int[np.ndarray, "W"]:

@@ -212,7 +212,7 @@ def _denoised(recipe: Recipe, denoiser: Graph, tensors: Mapping[str, Tensor], se
     if schedule is None:
         raise ExportError("denoiser: the recipe has no schedule.")
     rows = len(tensors["observation"])
-    first = x_first(recipe.x_t_shape, schedule=schedule, seed=seed, sample_index=0)
+    (first,) = x_first(recipe.x_t_shape, schedule=schedule, seed=seed, sample_indices=(0,))
     x_t = torch.from_numpy(first).expand(rows, *recipe.x_t_shape)
     x0 = x_t
     for t in timesteps(schedule.num_steps, schedule.num_steps):

@@ -73,21 +73,20 @@ def train(
         StoreError: the store does not fit the recipe.
     """
     torch.manual_seed(seed)
+    _claim(recipe, folder)
+    state = load_checkpoint(folder, device) if (folder / CHECKPOINT_FILE).exists() else None
     run = Run(
         recipe=recipe,
         folder=folder,
         network=recipe.build().to(device),
         device=device,
         batches=Batches(store, recipe.data, seed=seed),
-        progress=Progress(),
+        progress=Progress(**state["progress"]) if state else Progress(),
     )
-    _claim(run)
-    state = load_checkpoint(folder, device) if (folder / CHECKPOINT_FILE).exists() else None
-    if start_from and not state:
-        run.network.load_state_dict(_weights_of(start_from, device))
     if state:
         run.network.load_state_dict(state["network"])
-        run.progress.__init__(**state["progress"])  # type: ignore[misc]  # restored in place
+    elif start_from:
+        run.network.load_state_dict(_weights_of(start_from, device))
     writer = SummaryWriter(str(folder / "tensorboard"))
     for index in range(run.progress.stage, len(recipe.stages)):
         resumed = state if state and state["progress"]["stage"] == index else None
@@ -129,15 +128,15 @@ def _weights_of(folder: Path, device: torch.device) -> dict[str, Tensor]:
     return weights
 
 
-def _claim(run: Run) -> None:
-    written = json.dumps(describe(run.recipe), indent=1)
-    path = run.folder / RECIPE_FILE
+def _claim(recipe: Recipe, folder: Path) -> None:
+    written = json.dumps(describe(recipe), indent=1)
+    path = folder / RECIPE_FILE
     if path.exists() and path.read_text() != written:
         raise RunError(
             f"{path}: the folder holds a run of another recipe or of other settings; "
             "choose another folder, or delete this one."
         )
-    run.folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     path.write_text(written)
 
 

@@ -63,13 +63,13 @@ class Engine:
             steps = timesteps(self.manifest.num_steps, self._num_steps(request))
             num_rows = request.num_samples
         self._jobs[request_id] = _Job(request=request, timesteps=steps, num_rows=num_rows)
-        for sample_index in range(num_rows):
+        for sample_index, x_t in enumerate(self._x_first(request.seed, num_rows)):
             self._scheduler.put(
                 Trajectory(
                     request_id=request_id,
                     sample_index=sample_index,
                     num_steps=len(steps),
-                    x_t=self._x_first(request.seed, sample_index),
+                    x_t=x_t,
                 )
             )
         return request_id
@@ -155,11 +155,15 @@ class Engine:
                 return []
         return [row for group in groups for row in self._alone_on_error(run, group, failures)]
 
-    def _x_first(self, seed: int, sample_index: int) -> Float[np.ndarray, "..."]:
-        shape = self.manifest.x_t_shape
+    def _x_first(self, seed: int, num_rows: int) -> Float[np.ndarray, "S ..."]:
         if self._schedule is None:
-            return np.zeros(shape, np.float32)
-        return x_first(shape, schedule=self._schedule, seed=seed, sample_index=sample_index)
+            return np.zeros((num_rows, 1), np.float32)
+        return x_first(
+            self.manifest.x_t_shape,
+            schedule=self._schedule,
+            seed=seed,
+            sample_indices=range(num_rows),
+        )
 
     def _denoised(self, rows: Sequence[Trajectory]) -> list[Trajectory]:
         if self._schedule is None:
@@ -184,12 +188,12 @@ class Engine:
             noise(
                 row.x_t.shape,
                 seed=self._jobs[row.request_id].request.seed,
-                sample_index=row.sample_index,
+                sample_indices=(row.sample_index,),
                 draw=row.steps_run + 1,
             )
             for row in rows
         ]
-        return np.stack(draws)
+        return np.concatenate(draws)
 
     def _decoded(self, rows: Sequence[Trajectory]) -> list[Trajectory]:
         contexts, index = self._contexts(rows)

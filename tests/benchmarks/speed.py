@@ -43,9 +43,9 @@ def paper_sized(recipe: Recipe) -> Callable[[], Tensor]:
 
     @torch.no_grad()
     def sample() -> Tensor:
-        condition, code = encoder(seen)
+        condition, *others = encoder(seen)
         x = torch.randn(NUM_SAMPLES, *recipe.x_t_shape)
-        rows = [value.expand(NUM_SAMPLES, -1) for value in (condition, code)]
+        rows = [value.expand(NUM_SAMPLES, *value.shape[1:]) for value in (condition, *others, seen)]
         x0 = x
         for t in timesteps(schedule.num_steps, schedule.num_steps):
             x0 = denoiser(x, torch.full((NUM_SAMPLES,), t), rows[0])
@@ -57,7 +57,7 @@ def paper_sized(recipe: Recipe) -> Callable[[], Tensor]:
                 alpha_bar_next=float(schedule.alpha_bar[t - 1]) if t else 1.0,
                 variance_next=float(schedule.variance[t - 1, 0]) if t else 0.0,
             )
-        return decoder(x0, rows[1], seen.expand(NUM_SAMPLES, -1, -1, -1))
+        return decoder(x0, *rows[1:])
 
     return sample
 

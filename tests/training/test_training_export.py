@@ -61,7 +61,7 @@ def test_same_network_gives_the_same_bytes(recipe, seen, tmp_path):
 def test_graph_that_asks_for_what_none_gives_is_refused(recipe, seen, tmp_path):
     def broken(network):
         first, *others = recipe.graphs(network)
-        return (dataclasses.replace(first, outputs=("condition", "misnamed")), *others)
+        return (dataclasses.replace(first, outputs=("condition", "misnamed", "expected")), *others)
 
     with pytest.raises(ExportError, match="asks for target_code"):
         exported(dataclasses.replace(recipe, graphs=broken), tmp_path / "made", seen)
@@ -76,9 +76,9 @@ class Restless(torch.nn.Module):
         self.decoder = decoder
         self.calls = 0
 
-    def forward(self, x0, target_code, observation):
+    def forward(self, x0, target_code, expected, observation):
         self.calls += 1
-        return self.decoder(x0, target_code, observation) + 0.01 * self.calls
+        return self.decoder(x0, target_code, expected, observation) + 0.01 * self.calls
 
 
 def test_disagreement_between_torch_and_onnxruntime_writes_nothing(recipe, seen, tmp_path):

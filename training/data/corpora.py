@@ -14,10 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from models.motion.formats.files import read_motion
+from models.motion.formats.h36m import holds_h36m, read_h36m
 from models.motion.formats.npz import Clip, read_archive
 from models.motion.motion import Motion
 
 VALID_SHARE = 0.08
+H36M_TEST_SUBJECTS = ("S9", "S11")
 KINDS = (".npz", ".amc", ".bvh")
 """In this order, so that where a take is found twice the one on the actor's own skeleton stays."""
 
@@ -62,7 +64,9 @@ def read_takes(path: Path) -> Iterator[Take]:
     Raises:
         FormatError: the file cannot be read.
     """
-    if path.suffix.lower() == ".npz":
+    if path.suffix.lower() == ".npz" and holds_h36m(path):
+        yield from (_of_h36m(subject, motion) for subject, motion in read_h36m(path))
+    elif path.suffix.lower() == ".npz":
         yield from (_archived(clip) for clip in read_archive(path))
     else:
         motion = read_motion(path)
@@ -75,6 +79,12 @@ def read_takes(path: Path) -> Iterator[Take]:
             style=said.get("style", ""),
             subject=said.get("subject", ""),
         )
+
+
+def _of_h36m(subject: str, motion: Motion) -> Take:
+    split = "test" if subject in H36M_TEST_SUBJECTS else "train"
+    action = motion.name.removeprefix(f"{subject}_").rstrip("_0123456789")
+    return Take(motion=motion, split=split, source="h36m", action=action, subject=subject)
 
 
 def take_fields(path: Path) -> dict[str, str]:

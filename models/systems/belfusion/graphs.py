@@ -16,12 +16,12 @@ class Encoder(nn.Module):
 
     def forward(
         self, observation: Float[Tensor, "B T J 3"]
-    ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B G"]]:
-        """The denoiser's condition and the code of the target motion."""
+    ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B G"], Float[Tensor, "B H F"]]:
+        """The denoiser's condition, the code of the target motion, and where that points."""
         features = self.network.representation.enter(observation, observation)
         condition = self.network.denoiser.condition(self.network.context(features))
-        code = self.network.coupler.encode_target(features[:, -self.network.num_target :])
-        return condition, code
+        target, coupler = features[:, -self.network.num_target :], self.network.coupler
+        return condition, coupler.encode_target(target), coupler.expected(target)
 
 
 class Denoiser(nn.Module):
@@ -53,13 +53,13 @@ class Decoder(nn.Module):
         self,
         x0: Float[Tensor, "B D"],
         target_code: Float[Tensor, "B G"],
+        expected: Float[Tensor, "B H F"],
         observation: Float[Tensor, "B T J 3"],
     ) -> Float[Tensor, "B H J 3"]:
         """Future poses in the world of the observation."""
         coupler, representation = self.network.coupler, self.network.representation
         offsets = coupler.offsets(self.network.latent_range.inverse(x0), target_code)
-        target = representation.enter(observation, observation[:, -self.network.num_target :])
-        return representation.leave(observation, coupler.frames(offsets, target))
+        return representation.leave(observation, coupler.frames(offsets, expected))
 
 
 def graphs(network: BeLFusion) -> tuple[Graph, ...]:
@@ -69,7 +69,7 @@ def graphs(network: BeLFusion) -> tuple[Graph, ...]:
             role="encoder",
             module=Encoder(network),
             inputs=("observation",),
-            outputs=("condition", "target_code"),
+            outputs=("condition", "target_code", "expected"),
         ),
         Graph(
             role="denoiser",
@@ -80,7 +80,7 @@ def graphs(network: BeLFusion) -> tuple[Graph, ...]:
         Graph(
             role="decoder",
             module=Decoder(network),
-            inputs=("x0", "target_code", "observation"),
+            inputs=("x0", "target_code", "expected", "observation"),
             outputs=("future",),
         ),
     )

@@ -66,7 +66,7 @@ class BeLFusion(nn.Module):
     ) -> Float[Tensor, "B H F"]:
         """Features of the future that performs behaviour z from x_m on."""
         offsets = self.coupler.offsets(z, self.coupler.encode_target(target))
-        frames: Tensor = self.coupler.frames(offsets, target)
+        frames: Tensor = self.coupler.frames(offsets, self.coupler.expected(target))
         return frames
 
 

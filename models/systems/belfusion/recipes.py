@@ -8,6 +8,7 @@ from models.motion.skeleton import BODY21, H36M17, SMPL22
 from models.pose import RootRelativePoses, WorldPoses
 from models.system import Augmentation, Data, Recipe, Stage
 from models.systems.belfusion import objective, recurrent, spectral
+from models.systems.belfusion.dense_unet import DenseUNet
 from models.systems.belfusion.graphs import graphs
 from models.systems.belfusion.objective import BeLFusion
 from models.systems.belfusion.unet import PictureUNet
@@ -61,7 +62,7 @@ def build_spectral(*, data: Data, sizes: SpectralSizes, root_weight: float) -> B
             context=sizes.context,
             hidden=sizes.observation,
         ),
-        denoiser=spectral.DenseUNet(
+        denoiser=DenseUNet(
             latent=sizes.latent, context=sizes.context, widths=sizes.levels, num_steps=NUM_STEPS
         ),
         latent=sizes.latent,
@@ -167,7 +168,7 @@ def mocap_everything() -> Recipe:
 def mocap_cmu() -> Recipe:
     """`mocap` on the CMU database alone, whose terms permit commercial use."""
     return dataclasses.replace(
-        mocap(shares={"cmu": 1.0}, updates=(1_500, 500, 500, 8_000)), name="mocap_cmu"
+        mocap(shares={"cmu": 1.0}, updates=(1_500, 500, 300, 5_000)), name="mocap_cmu"
     )
 
 

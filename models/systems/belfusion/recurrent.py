@@ -72,11 +72,15 @@ class RecurrentCoupler(nn.Module):
         frames = self.decoder(joined.flatten(0, -2))[:, self.num_target :]
         return frames.reshape(*joined.shape[:-1], -1)
 
+    def expected(self, target: Float[Tensor, "B C F"]) -> Float[Tensor, "B H F"]:
+        """The last pose at every frame, from which the offsets count."""
+        return target[:, -1:].expand(-1, self.decoder.num_frames - self.num_target, -1)
+
     def frames(
-        self, offsets: Float[Tensor, "B HF"], target: Float[Tensor, "B C F"]
+        self, offsets: Float[Tensor, "B HF"], expected: Float[Tensor, "B H F"]
     ) -> Float[Tensor, "B H F"]:
         """The future frame by frame."""
-        return target[:, -1:] + offsets.unflatten(1, (-1, target.shape[2]))
+        return expected + offsets.unflatten(1, (-1, expected.shape[2]))
 
 
 class RecurrentObservationAutoencoder(nn.Module):
