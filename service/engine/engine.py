@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count, groupby
 
 import numpy as np
@@ -24,9 +24,9 @@ class _Job:
 
     request: Request
     timesteps: tuple[int, ...]
-    num_rows: int
+    futures: Float[np.ndarray, "R H J 3"]
+    num_done: int = 0
     context: Tensors | None = None
-    futures: dict[int, Float[np.ndarray, "H J 3"]] = field(default_factory=dict)
 
 
 class Engine:
@@ -62,7 +62,10 @@ class Engine:
         if self._schedule is not None:
             steps = timesteps(self.manifest.num_steps, self._num_steps(request))
             num_rows = request.num_samples
-        self._jobs[request_id] = _Job(request=request, timesteps=steps, num_rows=num_rows)
+        shape = (num_rows, self.manifest.horizon, len(self.manifest.skeleton.joints), 3)
+        self._jobs[request_id] = _Job(
+            request=request, timesteps=steps, futures=np.empty(shape, np.float32)
+        )
         for sample_index, x_t in enumerate(self._x_first(request.seed, num_rows)):
             self._scheduler.put(
                 Trajectory(
@@ -200,7 +203,9 @@ class Engine:
         x0 = np.stack([row.x_t for row in rows])
         futures = self._runner.decode(x0, contexts=contexts, index=index)
         for row, future in zip(rows, futures, strict=True):
-            self._jobs[row.request_id].futures[row.sample_index] = future
+            job = self._jobs[row.request_id]
+            job.futures[row.sample_index] = future
+            job.num_done += 1
         return list(rows)
 
     def _contexts(self, rows: Sequence[Trajectory]) -> tuple[list[Tensors], Int64[np.ndarray, "B"]]:
@@ -217,7 +222,7 @@ class Engine:
         results = []
         for request_id in {row.request_id: 0 for row in rows}:
             job = self._jobs.get(request_id)
-            if job is not None and len(job.futures) == job.num_rows:
+            if job is not None and job.num_done == len(job.futures):
                 results.append(_result(request_id, job, steps_of=self.manifest.num_steps))
                 del self._jobs[request_id]
         return results
@@ -229,7 +234,7 @@ def predict(engine: Engine, request: Request) -> Result:
 
 
 def _result(request_id: int, job: _Job, *, steps_of: int) -> Result:
-    futures = np.stack([job.futures[i] for i in range(job.num_rows)])
+    futures = job.futures
     if len(futures) < job.request.num_samples:
         futures = np.repeat(futures, job.request.num_samples, axis=0)
     return Result(
