@@ -157,7 +157,7 @@ def mocap_held_out() -> Recipe:
 
 
 def mocap_everything() -> Recipe:
-    """What ships: a finished `mocap_held_out` goes on, now on everything, its latents kept."""
+    """What ships: a finished `mocap_held_out` goes on, on every training clip, latents kept."""
     recipe = mocap()
     denoiser = dataclasses.replace(
         recipe.stages[-1], prepare=None, num_updates=6_000, learning_rate=4e-4
