@@ -19,10 +19,11 @@ from training.data.store import ClipRecord, Store, select
 from training.data.windows import Windows, cut
 from training.predictors import (
     BundlePredictor,
-    ConstantVelocity,
+    Extrapolation,
     Predictor,
     Retrieval,
-    ZeroVelocity,
+    carried_on,
+    held,
 )
 from training.scores import Evaluation, Row, Scorer, TestWindows
 
@@ -100,8 +101,10 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
     ]
     data = {manifest.name: _data(manifest, store) for _, manifest in bundles}
     predictors: dict[str, Predictor] = {
-        REFERENCE: ZeroVelocity(skeleton=store.skeleton, horizon=horizon),
-        "constant velocity": ConstantVelocity(skeleton=store.skeleton, horizon=horizon),
+        REFERENCE: Extrapolation(rule=held, skeleton=store.skeleton, horizon=horizon),
+        "constant velocity": Extrapolation(
+            rule=carried_on, skeleton=store.skeleton, horizon=horizon
+        ),
         "retrieval": Retrieval(
             store=store,
             windows=_bank(store, data, tests, num_frames=num_observed + horizon),

@@ -1,5 +1,6 @@
 """The one training loop: every stage of every system."""
 
+import dataclasses
 import json
 import math
 import time
@@ -169,10 +170,8 @@ def _run_stage(
         _learn(optimiser, learning, losses, stage)
         if stage.ema_decay:
             _average(averaged, learning, min(stage.ema_decay, (1 + update) / (10 + update)))
-        run.progress.update, run.progress.total_updates = (
-            update + 1,
-            run.progress.total_updates + 1,
-        )
+        run.progress.update += 1
+        run.progress.total_updates += 1
         bar.update()
         if update % UPDATES_BETWEEN_REPORTS == 0:
             _report(run, stage, losses, bar, writer)
@@ -248,8 +247,10 @@ def _report(run: Run, stage: Stage, losses: Losses, bar: Any, writer: SummaryWri
 
 
 def _save(run: Run, optimiser: torch.optim.Optimizer | None, averaged: list[Tensor] | None) -> None:
-    progress = {name: getattr(run.progress, name) for name in Progress.__slots__}
-    state: dict[str, Any] = {"network": run.network.state_dict(), "progress": progress}
+    state: dict[str, Any] = {
+        "network": run.network.state_dict(),
+        "progress": dataclasses.asdict(run.progress),
+    }
     if optimiser:
         state |= {"optimiser": optimiser.state_dict(), "averaged": averaged}
     save_checkpoint(run.folder, state)

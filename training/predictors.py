@@ -78,26 +78,23 @@ class BundlePredictor:
             }
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ZeroVelocity:
-    """The last pose, held."""
-
-    skeleton: Skeleton
-    horizon: int
-
-    def __call__(
-        self, observations: Observations, bones: Sequence[BoneLengths]
-    ) -> Iterator[Answer]:
-        """One answer for each observation, in order."""
-        for observation in observations:
-            held = np.repeat(observation[None, -1:], self.horizon, axis=1)
-            yield _fitted(held, observation, self.skeleton, bones)
+def held(observation: Float[np.ndarray, "T J 3"], horizon: int) -> Float[np.ndarray, "H J 3"]:
+    """The last pose, at every frame."""
+    return np.repeat(observation[-1:], horizon, axis=0)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ConstantVelocity:
+def carried_on(observation: Float[np.ndarray, "T J 3"], horizon: int) -> Float[np.ndarray, "H J 3"]:
     """The last pose, carried on at the root's mean velocity over the last few frames."""
+    frames = np.arange(1, horizon + 1, dtype=np.float32)[:, None, None]
+    root = observation[-1 - VELOCITY_FRAMES :, :1]
+    return observation[-1] + frames * ((root[-1] - root[0]) / (len(root) - 1))
 
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Extrapolation:
+    """One future by a rule, from the observation alone."""
+
+    rule: Callable[[np.ndarray, int], np.ndarray]
     skeleton: Skeleton
     horizon: int
 
@@ -105,11 +102,9 @@ class ConstantVelocity:
         self, observations: Observations, bones: Sequence[BoneLengths]
     ) -> Iterator[Answer]:
         """One answer for each observation, in order."""
-        frames = np.arange(1, self.horizon + 1, dtype=np.float32)[:, None, None]
         for observation in observations:
-            root = observation[-1 - VELOCITY_FRAMES :, :1]
-            gone = observation[-1] + frames * ((root[-1] - root[0]) / (len(root) - 1))
-            yield _fitted(gone[None], observation, self.skeleton, bones)
+            future = self.rule(observation, self.horizon)
+            yield _fitted(future[None], observation, self.skeleton, bones)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

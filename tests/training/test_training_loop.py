@@ -5,13 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from tiny_bundles import walking
+from people import small_store
 
-from models.motion.skeleton import BODY21
 from models.system import Recipe
 from training.checkpoint import CHECKPOINT_FILE, CheckpointError, load_checkpoint
 from training.cli import load_recipe
-from training.data.store import ClipRecord, Recording, Store, open_store, write_store
+from training.data.store import Store
 from training.loop import RunError, train, trained_network
 
 CPU = torch.device("cpu")
@@ -19,20 +18,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    """Walkers of six speeds, four seconds each."""
-    folder = tmp_path_factory.mktemp("stores") / "walkers"
-    clips = []
-    for index, speed in enumerate(np.linspace(0.2, 1.7, 6)):
-        positions = walking(120, fps=30.0, speed=float(speed)).astype(np.float32)
-        record = ClipRecord(
-            name=f"walk_{index}", source="made", split="train", start=0, length=len(positions)
-        )
-        recording = Recording(
-            positions=positions, rotations=None, rest_offsets=np.zeros((21, 3), np.float32)
-        )
-        clips.append((record, recording))
-    write_store(folder, skeleton=BODY21, fps=30.0, clips=clips, files={})
-    return open_store(folder)
+    return small_store(tmp_path_factory.mktemp("stores") / "walkers")
 
 
 @pytest.fixture

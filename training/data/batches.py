@@ -17,7 +17,7 @@ TAKEN_AHEAD = 4
 
 
 def training_clips(store: Store, data: Data) -> tuple[ClipRecord, ...]:
-    """Clips of the split ``train`` (all of them where a recipe trains on everything it may)."""
+    """Clips of the split ``train`` from the recipe's sources, without those it holds out."""
     wanted = select(store.clips, ("split=train",))
     held_out = set(select(store.clips, data.hold_out))
     sources = tuple(data.shares) if data.shares else ("",)

@@ -42,10 +42,9 @@ class DenseUNet(nn.Module):
     ) -> None:
         super().__init__()
         self.stem = nn.Linear(latent, widths[0])
-        blocks = [(w, w) for w in widths]
         rising = list(zip(widths[-2::-1], widths[:0:-1], strict=True))
         self.down = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
-        self.falling = nn.ModuleList(DenseBlock(*b) for b in blocks)
+        self.falling = nn.ModuleList(DenseBlock(width, width) for width in widths)
         self.middle = DenseBlock(widths[-1], widths[-1])
         self.rising = nn.ModuleList(DenseBlock(wide + low, wide) for wide, low in rising)
         self.norm = nn.LayerNorm(widths[0])
