@@ -81,6 +81,24 @@ class ScheduleSpec(_Record):
         return Schedule(alpha_bar=np.array(self.alpha_bar), variance=np.array(self.variance))
 
 
+class ActionsSpec(_Record):
+    """How a bundle that performs actions is stepped and stopped.
+
+    Its decoder gives ``chunk_frames`` frames at a time; what it returns as ``next_<name>`` is its
+    input ``<name>`` for the chunk after. An action ends at the first frame, not before
+    ``min_frames``, from which ``stop_window`` frames stay within ``stop_threshold_m`` of their
+    mean (Mao et al. 2022, Eq. 8, over all joints in metres), or after ``horizon`` frames.
+    """
+
+    labels: tuple[str, ...] = Field(min_length=1)
+    examples: dict[str, str] = Field(default_factory=dict)
+    """For some labels, what a person does who performs it."""
+    chunk_frames: int = Field(gt=0)
+    min_frames: int = Field(default=1, gt=0)
+    stop_window: int = Field(default=5, gt=1)
+    stop_threshold_m: float = Field(gt=0)
+
+
 class Manifest(_Record):
     """Everything that the generic server must know of a bundle."""
 
@@ -99,6 +117,8 @@ class Manifest(_Record):
     symmetries: tuple[Literal["yaw", "translation"], ...] = ()
     schedule: ScheduleSpec | None = None
     x_t_shape: tuple[int, ...] = ()
+    """Of a row's noise: x_t where there is a denoiser, else what a graph asks for as ``noise``."""
+    actions: ActionsSpec | None = None
     encoder: GraphSpec | None = None
     denoiser: GraphSpec | None = None
     decoder: GraphSpec
@@ -109,6 +129,22 @@ class Manifest(_Record):
     def _denoiser_has_a_schedule(self) -> "Manifest":
         if (self.denoiser is None) != (self.schedule is None):
             raise ValueError("schedule: a bundle has a denoiser and a schedule, or neither.")
+        return self
+
+    @model_validator(mode="after")
+    def _actions_are_decoded_in_chunks(self) -> "Manifest":
+        if self.actions is not None and self.denoiser is not None:
+            raise ValueError("actions: a bundle denoises or performs actions, not both.")
+        if self.actions is not None and self.encoder is None:
+            raise ValueError("actions: a bundle that performs actions has an encoder.")
+        return self
+
+    @model_validator(mode="after")
+    def _decoder_gives_as_many_frames_as_are_said(self) -> "Manifest":
+        num_frames = self.actions.chunk_frames if self.actions else self.horizon
+        shapes = {tensor.name: tensor.shape for tensor in self.decoder.outputs}
+        if num_frames not in shapes.get("future", ())[1:2]:
+            raise ValueError(f"decoder: must give future (B, {num_frames}, J, 3).")
         return self
 
     def graphs(self) -> dict[str, GraphSpec]:

@@ -18,7 +18,11 @@ from models.motion.skeleton import Skeleton
 Batch = Mapping[str, Tensor]
 """``observation (B, T, J, 3)``, ``seen``, the same with sensor noise, and ``future (B, H, J, 3)``.
 
-All in metres, in the world of the capture.
+All in metres, in the world of the capture. Recipes with `Data.actions` get three more of int64:
+``action (B,)``, the label that the future performs; ``first (B,)``, the frames of the future that
+nobody has seen, which lead over from the observation; ``length (B,)``, those after which the
+action has ended and its last pose is repeated. The future from ``first`` on is to be learnt up to
+``length`` + `Actions.padding`; what stands outside is filled with the nearest known frame.
 """
 
 Losses = dict[str, Tensor]
@@ -40,6 +44,23 @@ class Augmentation:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Actions:
+    """Labelled actions to learn, and how observations and actions are paired (Mao et al. 2022)."""
+
+    labels: Mapping[str, tuple[str, ...]]
+    """Selectors of clips, such as ``action=walk``, by the label that they are learnt under."""
+    examples: Mapping[str, str] = field(default_factory=dict)
+    other_share: float = 0.5
+    """Share of pairs whose observation is from a clip of another action."""
+    padding: int = 20
+    """P: frames after the end in which the model learns to stand still."""
+    longest_transition: int = 25
+    chunk_frames: int = 20
+    min_frames: int = 15
+    stop_threshold_m: float = 0.02
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Data:
     """Which windows a recipe learns from."""
 
@@ -52,6 +73,8 @@ class Data:
     hold_out: tuple[str, ...] = ()
     """Selectors such as ``style=tired`` of clips that must not be learnt from."""
     augmentation: Augmentation = field(default_factory=Augmentation)
+    actions: Actions | None = None
+    """Where given, whole actions are learnt instead of windows; ``horizon`` is the longest."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -11,6 +11,7 @@ import torch
 
 from models.bundle import (
     CARD_FILE,
+    ActionsSpec,
     GraphSpec,
     Manifest,
     ScheduleSpec,
@@ -31,6 +32,15 @@ X_T = TensorSpec(name="x_t", shape=("B", *X_T_SHAPE))
 TIMESTEP = TensorSpec(name="timestep", shape=("B",), dtype="int64")
 X0 = TensorSpec(name="x0", shape=("B", *X_T_SHAPE))
 FUTURE = TensorSpec(name="future", shape=("B", HORIZON, NUM_JOINTS, 3))
+
+LABELS, CHUNK_FRAMES, MIN_FRAMES, NOISE_SHAPE = ("reach", "crouch", "wave"), 8, 6, (2,)
+ACTION = TensorSpec(name="action", shape=("B",), dtype="int64")
+NOISE = TensorSpec(name="noise", shape=("B", *NOISE_SHAPE))
+PACE = TensorSpec(name="pace", shape=("B", *NOISE_SHAPE))
+GOAL = TensorSpec(name="goal", shape=("B", NUM_JOINTS, 3))
+POSE = TensorSpec(name="pose", shape=("B", NUM_JOINTS, 3))
+NEXT_POSE = TensorSpec(name="next_pose", shape=("B", NUM_JOINTS, 3))
+CHUNK = TensorSpec(name="future", shape=("B", CHUNK_FRAMES, NUM_JOINTS, 3))
 
 
 class Encoder(torch.nn.Module):
@@ -73,6 +83,52 @@ class Decoder(torch.nn.Module):
     ) -> torch.Tensor:
         drift = self.linear(torch.cat([x0.flatten(1), context], 1)).reshape(-1, 1, NUM_JOINTS, 3)
         return observation[:, -1:] + 0.2 * drift * self.ramp[None, :, None, None]
+
+
+class ActionEncoder(torch.nn.Module):
+    """Where an action leads and the pose that it starts from; NaN for a body that is too fast."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.motion = Encoder()
+        self.linear = torch.nn.Linear(12, NUM_JOINTS * 3)
+        self.reach = torch.nn.Embedding(len(LABELS), NUM_JOINTS * 3)
+
+    def forward(
+        self, observation: torch.Tensor, action: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        pose = observation[:, -1]
+        reach = self.reach(action) + 0.1 * self.linear(self.motion(observation))
+        return pose + 0.5 * reach.reshape(-1, NUM_JOINTS, 3), pose
+
+
+class PacedEncoder(ActionEncoder):
+    """The same, and a pace for the decoder: the noise where it is given, else none."""
+
+    def forward(
+        self, observation: torch.Tensor, action: torch.Tensor, *noise: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        still = 0.0 * observation[:, 0, 0, :2]
+        return *super().forward(observation, action), noise[0] + still if noise else still
+
+
+class ActionDecoder(torch.nn.Module):
+    """The next frames of a body that comes to rest at its goal, and the last of them.
+
+    Every frame is nearer to the goal by a factor that the pace decides.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("times", torch.arange(1.0, CHUNK_FRAMES + 1))
+
+    def forward(
+        self, pace: torch.Tensor, goal: torch.Tensor, pose: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        left = 0.88 + 0.06 * torch.tanh(pace[:, :1])
+        left = (left**self.times)[:, :, None, None]
+        future = goal[:, None] + left * (pose - goal)[:, None]
+        return future, future[:, -1]
 
 
 class LastPose(torch.nn.Module):
@@ -164,6 +220,34 @@ def write_diffusion_bundle(folder: Path, *, eta: float = 0.0, directions: int = 
         ),
     }
     return write(folder, graphs, schedule=spec, x_t_shape=X_T_SHAPE)
+
+
+def write_actions_bundle(folder: Path, *, draws: str | None = "decoder") -> Path:
+    """A bundle that performs `LABELS`; its decoder, its encoder or no graph asks for noise."""
+    if draws == "decoder":
+        encoder, pace, inputs, outputs = ActionEncoder, NOISE, (), ()
+    else:
+        encoder, pace, outputs = PacedEncoder, PACE, (PACE,)
+        inputs = (NOISE,) if draws else ()
+    graphs = {
+        "encoder": exported(
+            seeded(encoder, 4),
+            "encoder.onnx",
+            inputs=(OBSERVATION, ACTION, *inputs),
+            outputs=(GOAL, POSE, *outputs),
+        ),
+        "decoder": exported(
+            ActionDecoder(), "decoder.onnx", inputs=(pace, GOAL, POSE), outputs=(CHUNK, NEXT_POSE)
+        ),
+    }
+    actions = ActionsSpec(
+        labels=LABELS,
+        examples={"wave": "raises a hand"},
+        chunk_frames=CHUNK_FRAMES,
+        min_frames=MIN_FRAMES,
+        stop_threshold_m=0.02,
+    )
+    return write(folder, graphs, actions=actions, x_t_shape=NOISE_SHAPE)
 
 
 # Rest pose of a person of 1.75 m who faces +X, hips at the origin.

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from models.bundle import (
     CARD_FILE,
+    ActionsSpec,
     GraphSpec,
     Manifest,
     ScheduleSpec,
@@ -28,13 +29,18 @@ from models.bundle import (
 from models.diffusion import ddim_step, timesteps
 from models.system import Graph, Recipe, describe
 from service.engine.engine import Engine
+from service.engine.performing import NEXT
 from service.engine.runner import Runner
-from service.engine.sampling import x_first
+from service.engine.sampling import noise, x_first
 from service.engine.trajectory import Request
+from service.errors import EngineError
 
 OPSET = 17
 PARITY_M = 1e-4
 PARITY_BATCHES = (1, 5)
+# The exporter holds on to the batch of a recurrence's first state, and one row fits every batch.
+# What else holds on to it fails the parity check: the engine runs no graph on a single row.
+TRACED_ROWS = 1
 BATCH = "B"
 
 
@@ -75,11 +81,13 @@ def export(
 
     Raises:
         ExportError: torch and onnxruntime differ by more than 1e-4 m, or a graph asks for a tensor
-            that none gives. Nothing is written then.
+            that none gives or takes one batch only. Nothing is written then.
     """
-    graphs = {graph.role: graph for graph in recipe.graphs(network.eval().cpu())}
+    graphs = {graph.role: graph for graph in recipe.graphs(network.cpu())}
+    for graph in graphs.values():
+        graph.module.eval()  # the exporter puts back the mode that it found
     seen = observations[: max(PARITY_BATCHES)].astype(np.float32)
-    tensors = _example(recipe, graphs, torch.from_numpy(seen[:2]))
+    tensors = _example(recipe, graphs, torch.from_numpy(seen[:TRACED_ROWS]))
     specs, files = {}, {CARD_FILE: card.encode()}
     for role, graph in graphs.items():
         content = _onnx(graph, tensors)
@@ -102,6 +110,9 @@ def _example(
     if recipe.schedule:
         tensors["x_t"] = torch.zeros(rows, *recipe.x_t_shape)
         tensors["timestep"] = torch.arange(rows)
+    if recipe.data.actions:
+        tensors["action"] = torch.arange(rows) % len(recipe.data.actions.labels)
+        tensors["noise"] = torch.zeros(rows, *recipe.x_t_shape)
     for role in ("encoder", "denoiser", "decoder"):
         if role in graphs:
             tensors |= _run(graphs[role], tensors)
@@ -188,7 +199,41 @@ def _manifest(recipe: Recipe, label: Label, specs: Mapping[str, GraphSpec]) -> M
             alpha_bar=tuple(schedule.alpha_bar.tolist()),
             variance=tuple(tuple(row) for row in schedule.variance.tolist()),
         )
+    if data.actions:
+        fields["actions"] = ActionsSpec(
+            labels=tuple(data.actions.labels),
+            examples=dict(data.actions.examples),
+            chunk_frames=data.actions.chunk_frames,
+            min_frames=data.actions.min_frames,
+            stop_threshold_m=data.actions.stop_threshold_m,
+        )
     return Manifest(**fields, **dict[str, Any](specs))
+
+
+def trial_request(
+    recipe: Recipe, observation: Float[np.ndarray, "T J 3"], *, seed: int, num_samples: int = 1
+) -> Request:
+    """What a bundle of the recipe is tried with: two actions of two chunks and a half, if any."""
+    actions: tuple[int, ...] = ()
+    max_frames = None
+    if spec := recipe.data.actions:
+        actions = (0, len(spec.labels) - 1)
+        max_frames = min(recipe.data.horizon, 5 * spec.chunk_frames // 2)
+    return Request(
+        observation=observation,
+        num_samples=num_samples,
+        seed=seed,
+        actions=actions,
+        max_frames=max_frames,
+    )
+
+
+def unstopped(manifest: Manifest) -> Manifest:
+    """The same bundle, its actions as long as they may be: no error in rounding ends one early."""
+    if manifest.actions is None:
+        return manifest
+    actions = manifest.actions.model_copy(update={"min_frames": manifest.horizon})
+    return manifest.model_copy(update={"actions": actions})
 
 
 def reference_futures(
@@ -198,13 +243,45 @@ def reference_futures(
     *,
     seed: int,
 ) -> Float[np.ndarray, "B H J 3"]:
-    """Sample 0 of each observation by the whole loop in torch, with the server's own noise."""
+    """Sample 0 of each observation's `trial_request`, `unstopped`, by the whole loop in torch.
+
+    The noise is the server's own.
+    """
     tensors = {"observation": torch.from_numpy(observation)}
+    if recipe.data.actions:
+        return _performed(recipe, graphs, tensors["observation"], seed).numpy()
     if "encoder" in graphs:
         tensors |= _run(graphs["encoder"], tensors)
     if recipe.schedule:
         tensors["x0"] = _denoised(recipe, graphs["denoiser"], tensors, seed)
     return _run(graphs["decoder"], tensors)["future"].numpy()
+
+
+def _performed(
+    recipe: Recipe, graphs: Mapping[str, Graph], observation: Float[Tensor, "B T J 3"], seed: int
+) -> Float[Tensor, "B H J 3"]:
+    num_rows, num_observed = observation.shape[:2]
+    request = trial_request(recipe, observation[0].numpy(), seed=seed)
+    frames = observation
+    for k, action in enumerate(request.actions):
+        (drawn,) = noise(recipe.x_t_shape, seed=seed, sample_indices=(0,), draw=k)
+        tensors = {
+            "observation": frames[:, -num_observed:],
+            "action": torch.full((num_rows,), action),
+            "noise": torch.from_numpy(drawn).expand(num_rows, *recipe.x_t_shape),
+        }
+        tensors |= _run(graphs["encoder"], tensors)
+        made = frames[:, :0]
+        while made.shape[1] < (request.max_frames or recipe.data.horizon):
+            outputs = _run(graphs["decoder"], tensors)
+            made = torch.cat([made, outputs["future"]], dim=1)
+            tensors |= {
+                name.removeprefix(NEXT): value
+                for name, value in outputs.items()
+                if name.startswith(NEXT)
+            }
+        frames = torch.cat([frames, made[:, : request.max_frames]], dim=1)
+    return frames[:, num_observed:]
 
 
 def _denoised(recipe: Recipe, denoiser: Graph, tensors: Mapping[str, Tensor], seed: int) -> Tensor:
@@ -238,12 +315,14 @@ def _check_parity(
     observations: Float[np.ndarray, "S T J 3"],
 ) -> None:
     for rows in PARITY_BATCHES:
-        engine = Engine(Runner(manifest, folder), rows_per_step=rows)
+        engine = Engine(Runner(unstopped(manifest), folder), rows_per_step=rows)
         requests = [
-            Request(observation=observation, num_samples=1, seed=7)
-            for observation in observations[:rows]
+            trial_request(recipe, observation, seed=7) for observation in observations[:rows]
         ]
-        served = np.concatenate([result.futures for result in engine.run(requests)])
+        try:
+            served = np.concatenate([result.futures for result in engine.run(requests)])
+        except EngineError as error:
+            raise ExportError(f"parity: at batch {rows}: {error}") from error
         expected = reference_futures(recipe, graphs, observations[:rows], seed=7)
         worst = float(np.abs(served - expected).max())
         if not worst <= PARITY_M:

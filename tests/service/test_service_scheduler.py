@@ -1,24 +1,26 @@
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-import numpy as np
 import pytest
 
 from service.engine.scheduler import Scheduler
 from service.engine.trajectory import Trajectory
 
-NOTHING = np.zeros(1, np.float32)
+
+@dataclass(frozen=True)
+class Row:
+    request_id: int
+    sample_index: int
+    steps_run: int = 0
 
 
-def put(scheduler: Scheduler, request_id: int, num_rows: int, num_steps: int = 1) -> None:
+def put(scheduler: Scheduler, request_id: int, num_rows: int) -> None:
     for sample_index in range(num_rows):
-        scheduler.put(
-            Trajectory(
-                request_id=request_id, sample_index=sample_index, num_steps=num_steps, x_t=NOTHING
-            )
-        )
+        scheduler.put(Row(request_id, sample_index))
 
 
-def counts(rows: list[Trajectory]) -> Counter[int]:
+def counts(rows: Sequence[Trajectory]) -> Counter[int]:
     return Counter(row.request_id for row in rows)
 
 
@@ -48,13 +50,14 @@ def test_no_request_starves_when_there_are_more_requests_than_rows():
 
 def test_samples_of_a_request_advance_together():
     scheduler = Scheduler(rows_per_step=3)
-    put(scheduler, 0, 5, num_steps=2)
+    put(scheduler, 0, 5)
     seen = []
     while len(scheduler):
         for row in scheduler.take():
+            assert isinstance(row, Row)
             seen.append((row.steps_run, row.sample_index))
-            if not row.advanced(NOTHING).finished:
-                scheduler.put(row.advanced(NOTHING))
+            if row.steps_run < 1:
+                scheduler.put(replace(row, steps_run=row.steps_run + 1))
     assert seen == [(step, sample) for step in range(2) for sample in range(5)]
 
 

@@ -1,0 +1,64 @@
+"""Whether a request fits a bundle."""
+
+from models.bundle import Manifest
+from service.engine.trajectory import Request
+from service.errors import FieldError
+
+
+def check(request: Request, manifest: Manifest) -> None:
+    """Refuse a request that the bundle cannot answer.
+
+    Raises:
+        FieldError: the observation does not fit the bundle, or a number is out of range.
+    """
+    shape = (manifest.num_observed, len(manifest.skeleton.joints), 3)
+    if request.observation.shape != shape:
+        raise FieldError(
+            pointer="/observation",
+            found=f"shape {request.observation.shape}",
+            expected=f"{manifest.name} takes (frames, joints, xyz) = {shape}",
+        )
+    if request.num_samples < 1:
+        raise FieldError(
+            pointer="/num_samples", found=str(request.num_samples), expected="must be 1 or more"
+        )
+    if request.num_steps is not None and not 1 <= request.num_steps <= manifest.num_steps:
+        raise FieldError(
+            pointer="/num_steps",
+            found=str(request.num_steps),
+            expected=f"{manifest.name} runs 1 to {manifest.num_steps} steps",
+        )
+    _check_actions(request, manifest)
+    _check_stop(request, manifest)
+
+
+def _check_actions(request: Request, manifest: Manifest) -> None:
+    labels = manifest.actions.labels if manifest.actions else ()
+    unknown = [index for index in request.actions if not 0 <= index < len(labels)]
+    if not unknown and bool(request.actions) == bool(labels):
+        return
+    performs = f"one action or more of {', '.join(labels)}" if labels else "no actions"
+    raise FieldError(
+        pointer="/actions",
+        found=f"action {unknown[0]}" if unknown else "none",
+        expected=f"{manifest.name} performs {performs}",
+    )
+
+
+def _check_stop(request: Request, manifest: Manifest) -> None:
+    longest = manifest.horizon if manifest.actions else 0
+    if request.max_frames is not None and not 1 <= request.max_frames <= longest:
+        raise FieldError(
+            pointer="/max_seconds_per_action",
+            found=f"{request.max_frames / manifest.fps:g} s",
+            expected=f"{manifest.name} performs an action for at most {longest / manifest.fps:g} s",
+        )
+    threshold_m = request.stop_threshold_m
+    if threshold_m is not None and not (manifest.actions and threshold_m > 0):
+        raise FieldError(
+            pointer="/stop_threshold",
+            found=f"{threshold_m:g} m",
+            expected="must be above 0"
+            if manifest.actions
+            else f"{manifest.name} performs no actions",
+        )
