@@ -1,17 +1,31 @@
 """The bundles of a folder: loaded and warmed up one by one, each ready or refused by itself."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from models.bundle import CARD_FILE, BundleError, Manifest, ManifestError, read_manifest
+from models.bundle import (
+    CARD_FILE,
+    ActionsSpec,
+    BundleError,
+    Manifest,
+    ManifestError,
+    read_manifest,
+)
 from service.engine.engine import Engine, predict
 from service.engine.runner import Runner
 from service.engine.trajectory import Request
-from service.errors import EngineError, UnavailableError, UnknownModelError
+from service.errors import (
+    EngineError,
+    UnavailableError,
+    UnknownModelError,
+    UnsuitableModelError,
+)
 from service.worker import Worker
 
 DEFAULT_FILE = "DEFAULT"
@@ -30,17 +44,24 @@ class Entry:
     card: str = ""
     worker: Worker | None = field(default=None, repr=False)
 
+    def answers(self, *, with_actions: bool) -> bool:
+        """Whether requests with actions, or those without, are for it; unread, it has none."""
+        performs = self.manifest is not None and self.manifest.actions is not None
+        return performs == with_actions
+
 
 class Catalog:
-    """Every bundle of a folder by name; answers while it still loads."""
+    """Every bundle of a folder by name, with its manifest; answers while it still loads."""
 
     def __init__(self, folder: Path, *, default_model: str | None, threads: int) -> None:
         self._folder = folder
         self._threads = threads
         self.entries = {name: Entry(name=name) for name in bundle_names(folder)}
-        self.default_model = default_model or _default_of(folder, list(self.entries))
-        if self.default_model is not None:
-            self.entry(self.default_model)
+        names = [default_model] if default_model else _preferred(folder, list(self.entries))
+        self._preferred = [self.entry(name) for name in names]
+        for entry in self.entries.values():
+            with _refused_on_error(entry):
+                entry.manifest, entry.card = read_bundle(folder / entry.name)
 
     @property
     def state(self) -> Literal["loading", "ready", "unavailable"]:
@@ -50,15 +71,31 @@ class Catalog:
             return "loading"
         return "ready" if "ready" in states else "unavailable"
 
+    @property
+    def default_model(self) -> str | None:
+        """The name of the bundle that predicts when a request names none."""
+        entry = self.default(with_actions=False)
+        return entry.name if entry else None
+
     def load(self) -> None:
-        """Load every bundle, the default one first; a bundle that cannot be used is refused."""
-        for entry in sorted(self.entries.values(), key=lambda e: e.name != self.default_model):
-            try:
-                self._load(entry)
-            except (BundleError, EngineError, ValueError) as error:
-                _refuse(entry, str(error))
-            except OSError as error:  # its text holds the whole path, which is nobody's business
-                _refuse(entry, f"{entry.name}: a file cannot be read: {error.strerror}.")
+        """Load every bundle, preferred ones first; a bundle that cannot be used is refused."""
+        for entry in dict.fromkeys([*self._preferred, *self.entries.values()]):
+            if entry.state == "loading":
+                with _refused_on_error(entry):
+                    self._load(entry)
+            if entry.reason is not None:
+                _log.error("bundle %s is refused: %s", entry.name, entry.reason)
+
+    def default(self, *, with_actions: bool) -> Entry | None:
+        """The bundle for requests that name none: the first that is preferred and ready.
+
+        Where actions are performed, or every preferred bundle is of the other kind, it may be one
+        that is not preferred.
+        """
+        chosen = [e for e in self._preferred if e.answers(with_actions=with_actions)]
+        if with_actions or not chosen:
+            chosen += self._of_kind(with_actions=with_actions)
+        return next((entry for entry in chosen if entry.state == "ready"), next(iter(chosen), None))
 
     def entry(self, name: str) -> Entry:
         """The bundle of this name, in whatever state.
@@ -74,22 +111,63 @@ class Catalog:
             )
         return self.entries[name]
 
-    def ready(self, name: str | None) -> tuple[Manifest, Worker]:
+    def chosen(self, name: str | None, *, with_actions: bool) -> Entry:
+        """The bundle of this name, or the default one, for requests with or without actions.
+
+        Raises:
+            UnknownModelError: there is none of this name.
+            UnsuitableModelError: it is for the other kind of request.
+            UnavailableError: there is none at all.
+        """
+        kind = "performs actions" if with_actions else "predicts without actions"
+        if name is None:
+            default = self.default(with_actions=with_actions)
+            if default is None:
+                raise UnavailableError(
+                    f"model: found no bundle that {kind} on this server; it needs at least one."
+                )
+            return default
+        entry = self.entry(name)
+        if entry.manifest is not None and not entry.answers(with_actions=with_actions):
+            others = ", ".join(e.name for e in self._of_kind(with_actions=with_actions))
+            raise UnsuitableModelError(
+                pointer="/model",
+                found=repr(name),
+                expected=f"must be one that {kind}: {others or 'none is here'}",
+            )
+        return entry
+
+    def ready(self, name: str | None, *, with_actions: bool) -> tuple[Manifest, Worker]:
         """The bundle of this name, or the default one, which can answer.
 
         Raises:
             UnknownModelError: there is none of this name.
-            UnavailableError: it is loading, or was refused.
+            UnsuitableModelError: it is for the other kind of request.
+            UnavailableError: it is loading, or was refused, or there is none at all.
         """
-        wanted = name if name is not None else self.default_model
-        if wanted is None:
-            raise UnavailableError("model: found no bundle on this server; it needs at least one.")
-        entry = self.entry(wanted)
+        entry = self.chosen(name, with_actions=with_actions)
         if entry.state == "loading":
-            raise UnavailableError(f"model: {wanted} is loading; try again in a second.")
+            raise UnavailableError(f"model: {entry.name} is loading; try again in a second.")
         if entry.manifest is None or entry.worker is None:
-            raise UnavailableError(f"model: the bundle {wanted} was refused: {entry.reason}")
+            raise _refused(entry)
         return entry.manifest, entry.worker
+
+    def engine(self, entry: Entry) -> Engine:
+        """A new engine of a bundle.
+
+        Raises:
+            UnavailableError: the bundle was refused.
+            EngineError: a graph cannot be loaded.
+        """
+        if entry.manifest is None:
+            raise _refused(entry)
+        return Engine(Runner(entry.manifest, self._folder / entry.name, threads=self._threads))
+
+    def performers(self) -> dict[str, ActionsSpec]:
+        """What the bundles that perform actions know, by name, the default one first."""
+        default = self.default(with_actions=True)
+        ordered = sorted(self._of_kind(with_actions=True), key=lambda e: e is not default)
+        return {e.name: e.manifest.actions for e in ordered if e.manifest and e.manifest.actions}
 
     def stop(self) -> None:
         """Stop every worker; what they had not finished fails."""
@@ -97,18 +175,34 @@ class Catalog:
             if entry.worker is not None:
                 entry.worker.stop()
 
+    def _of_kind(self, *, with_actions: bool) -> list[Entry]:
+        """The bundles for requests with or without actions that were not refused."""
+        return [
+            entry
+            for entry in self.entries.values()
+            if entry.answers(with_actions=with_actions) and entry.state != "refused"
+        ]
+
     def _load(self, entry: Entry) -> None:
-        engine, card = load_bundle(self._folder / entry.name, threads=self._threads)
-        entry.manifest, entry.card = engine.manifest, card
+        engine = self.engine(entry)
         warm_up(engine)
         entry.worker = Worker(engine)
         entry.state = "ready"
 
 
-def _refuse(entry: Entry, reason: str) -> None:
-    entry.reason = reason
-    entry.state = "refused"
-    _log.error("bundle %s is refused: %s", entry.name, reason)
+@contextmanager
+def _refused_on_error(entry: Entry) -> Iterator[None]:
+    try:
+        yield
+    except (BundleError, EngineError, ValueError) as error:
+        entry.reason, entry.state = str(error), "refused"
+    except OSError as error:  # its text holds the whole path, which is nobody's business
+        entry.reason = f"{entry.name}: a file cannot be read: {error.strerror}."
+        entry.state = "refused"
+
+
+def _refused(entry: Entry) -> UnavailableError:
+    return UnavailableError(f"model: the bundle {entry.name} was refused: {entry.reason}")
 
 
 def bundle_names(folder: Path) -> list[str]:
@@ -118,12 +212,11 @@ def bundle_names(folder: Path) -> list[str]:
     return sorted(p.name for p in folder.iterdir() if p.is_dir() and p.name[0] not in "._")
 
 
-def load_bundle(folder: Path, *, threads: int) -> tuple[Engine, str]:
-    """The engine of a bundle, and its model card.
+def read_bundle(folder: Path) -> tuple[Manifest, str]:
+    """The manifest of a bundle, and its model card.
 
     Raises:
         BundleError: the bundle is damaged, or its name is not its folder's.
-        EngineError: a graph cannot be loaded.
     """
     manifest = read_manifest(folder)
     if manifest.name != folder.name:
@@ -132,11 +225,11 @@ def load_bundle(folder: Path, *, threads: int) -> tuple[Engine, str]:
         )
     card = folder / CARD_FILE
     text = card.read_text(encoding="utf-8", errors="replace") if card.is_file() else ""
-    return Engine(Runner(manifest, folder, threads=threads)), text
+    return manifest, text
 
 
 def warm_up(engine: Engine) -> None:
-    """Run every graph once, on a body that stands still.
+    """Run every graph, on a body that stands still and, where it can, performs the first action.
 
     Raises:
         EngineError: a graph does not run, or gives NaN.
@@ -144,11 +237,12 @@ def warm_up(engine: Engine) -> None:
     manifest = engine.manifest
     generator = np.random.Generator(np.random.Philox(key=[0, 0]))
     pose = generator.uniform(0.0, 1.0, (len(manifest.skeleton.joints), 3)).astype(np.float32)
-    predict(engine, Request(observation=np.repeat(pose[None], manifest.num_observed, axis=0)))
+    observation = np.repeat(pose[None], manifest.num_observed, axis=0)
+    predict(engine, Request(observation=observation, actions=(0,) if manifest.actions else ()))
 
 
-def _default_of(folder: Path, names: list[str]) -> str | None:
+def _preferred(folder: Path, names: list[str]) -> list[str]:
+    """The names in the file DEFAULT, one a line, or else the first bundle of all."""
     file = folder / DEFAULT_FILE
-    if file.is_file():
-        return file.read_text(encoding="utf-8").strip()
-    return names[0] if names else None
+    lines = file.read_text(encoding="utf-8").split() if file.is_file() else []
+    return lines or names[:1]

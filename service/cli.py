@@ -1,7 +1,7 @@
-"""The command line ``posefutures``: serve, predict, models."""
+"""The command line ``posefutures``: serve, predict, models, actions."""
 
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -10,24 +10,25 @@ from typing import Annotated, NoReturn
 import numpy as np
 import typer
 import uvicorn
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from pydantic import ValidationError
 
-from models.bundle import BundleError, read_manifest
+from models.bundle import BundleError
 from models.motion.formats.bvh import write_bvh
 from models.motion.formats.errors import FormatError
 from models.motion.formats.files import read_motion
 from models.motion.kinematics import inverse_kinematics
 from models.motion.motion import Motion
+from service.actions import action_indices, max_frames
 from service.app import create_app
 from service.axes import Axes
-from service.catalog import Catalog, load_bundle
+from service.catalog import Catalog
 from service.engine import engine
-from service.engine.trajectory import Request
+from service.engine.trajectory import Request, Segment
 from service.errors import FieldError, ServiceError
-from service.futures import caller_futures
+from service.futures import caller_futures, caller_segments
 from service.observation import frames_needed, observe
-from service.schemas import MAX_SEED
+from service.schemas import MAX_SEED, MAX_STOP_THRESHOLD_M
 from service.settings import Settings
 
 app = typer.Typer(
@@ -65,16 +66,25 @@ def serve(
 def models() -> None:
     """List the bundles."""
     with _one_line_errors():
-        settings = Settings()
-        catalog = Catalog(settings.bundles, default_model=settings.default_model, threads=1)
-        for name in catalog.entries:
-            mark = "*" if name == catalog.default_model else " "
-            try:
-                manifest = read_manifest(settings.bundles / name)
-            except BundleError as error:
-                typer.echo(f"{mark} {name}  refused: {error}")
+        catalog = _catalog(Settings())
+        defaults = [catalog.default(with_actions=kind) for kind in (False, True)]
+        for name, entry in catalog.entries.items():
+            mark = "*" if entry in defaults else " "
+            if entry.manifest is None:
+                typer.echo(f"{mark} {name}  refused: {entry.reason}")
             else:
+                manifest = entry.manifest
                 typer.echo(f"{mark} {name}  {manifest.version}  {manifest.description}")
+
+
+@app.command()
+def actions() -> None:
+    """List the actions that each bundle performs."""
+    with _one_line_errors():
+        for name, spec in _catalog(Settings()).performers().items():
+            typer.echo(name)
+            for label in spec.labels:
+                typer.echo(f"  {label}  {spec.examples.get(label, '')}".rstrip())
 
 
 @app.command()
@@ -87,17 +97,23 @@ def predict(
     out: Annotated[Path, typer.Option(help="folder to write into")] = Path(),
     output_format: Annotated[OutputFormat, typer.Option("--format")] = OutputFormat.BVH,
     at: Annotated[float | None, typer.Option(help="second that is now; the end by default")] = None,
+    actions: Annotated[str | None, typer.Option(help="labels to perform, such as walk,run")] = None,
+    stop_threshold: Annotated[
+        float | None,
+        typer.Option(max=MAX_STOP_THRESHOLD_M, help="metres within which an action has ended"),
+    ] = None,
+    max_seconds_per_action: Annotated[
+        float | None, typer.Option(help="when an action is cut off")
+    ] = None,
 ) -> None:
     """Write N futures of the motion in a file, in its own skeleton and frame rate."""
     with _one_line_errors():
         motion = read_motion(file)
-        settings = Settings()
-        catalog = Catalog(
-            settings.bundles, default_model=model or settings.default_model, threads=1
-        )
-        name = catalog.default_model or ""
-        bundle, _ = load_bundle(settings.bundles / name, threads=settings.threads)
-        seen = _until(motion, at, num_frames=frames_needed(bundle.manifest, motion.fps))
+        catalog = _catalog(Settings())
+        labels = [] if actions is None else [label.strip() for label in actions.split(",")]
+        bundle = catalog.engine(catalog.chosen(model, with_actions=actions is not None))
+        manifest = bundle.manifest
+        seen = _until(motion, at, num_frames=frames_needed(manifest, motion.fps))
         seed = secrets.randbelow(MAX_SEED + 1) if seed is None else seed
         observation = observe(
             seen.positions.astype(np.float64),
@@ -105,26 +121,43 @@ def predict(
             order=tuple(range(seen.skeleton.num_joints)),
             axes=Axes(),
             fps=seen.fps,
-            manifest=bundle.manifest,
+            manifest=manifest,
         )
         request = Request(
             observation=observation.positions,
             num_samples=num_samples,
             num_steps=num_steps,
             seed=seed,
+            actions=action_indices(labels, manifest),
+            stop_threshold_m=stop_threshold,
+            max_frames=max_frames(max_seconds_per_action, manifest),
         )
+        result = engine.predict(bundle, request)
         futures = caller_futures(
-            engine.predict(bundle, request).futures,
+            result.futures,
             observation,
-            manifest=bundle.manifest,
+            manifest=manifest,
             bone_lengths="observed",
+            segments=result.segments,
         )
+        segments = caller_segments(result.segments, manifest=manifest, fps=seen.fps)
         out.mkdir(parents=True, exist_ok=True)
         for warning in observation.warnings:
             typer.echo(f"warning: {warning}", err=True)
-        write = _write_bvh if output_format is OutputFormat.BVH else _write_npz
-        write(out, motion, futures)
-        typer.echo(f"{num_samples} futures of {file.name} by {name}, seed {seed}, in {out}")
+        if output_format is OutputFormat.BVH:
+            ends = [parts[-1].end for parts in segments] or [futures.shape[1]] * len(futures)
+            _write_bvh(
+                out, motion, [future[:end] for future, end in zip(futures, ends, strict=True)]
+            )
+        else:
+            _write_npz(out, motion, futures, **_performed(labels, segments))
+        typer.echo(
+            f"{num_samples} futures of {file.name} by {manifest.name}, seed {seed}, in {out}"
+        )
+
+
+def _catalog(settings: Settings) -> Catalog:
+    return Catalog(settings.bundles, default_model=settings.default_model, threads=settings.threads)
 
 
 def _until(motion: Motion, at: float | None, *, num_frames: int) -> Motion:
@@ -144,7 +177,7 @@ def _until(motion: Motion, at: float | None, *, num_frames: int) -> Motion:
     return motion[:end]
 
 
-def _write_bvh(out: Path, motion: Motion, futures: Float[np.ndarray, "N H J 3"]) -> None:
+def _write_bvh(out: Path, motion: Motion, futures: Sequence[Float[np.ndarray, "_ J 3"]]) -> None:
     width = len(str(len(futures) - 1))
     for i, future in enumerate(futures):
         rotations = None
@@ -164,13 +197,35 @@ def _write_bvh(out: Path, motion: Motion, futures: Float[np.ndarray, "N H J 3"])
         write_bvh(out / f"{name}.bvh", sample)
 
 
-def _write_npz(out: Path, motion: Motion, futures: Float[np.ndarray, "N H J 3"]) -> None:
+def _performed(
+    labels: Sequence[str], segments: Sequence[Sequence[Segment]]
+) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Labels (A,), and for each future and action the end in frames, and whether it stopped."""
+    if not segments:
+        return {}
+    ends = np.array([[part.end for part in parts] for parts in segments])
+    return {
+        "lengths": ends[:, -1],
+        "actions": np.array(labels),
+        "segment_ends": ends,
+        "stopped": np.array([[part.stopped for part in parts] for parts in segments]),
+    }
+
+
+def _write_npz(
+    out: Path,
+    motion: Motion,
+    futures: Float[np.ndarray, "N H J 3"],
+    **performed: Shaped[np.ndarray, "..."],
+) -> None:
     np.savez(
         out / f"{motion.name}-futures.npz",
+        allow_pickle=False,
         futures=futures.astype(np.float32),
         joints=np.array(motion.skeleton.joints),
         parents=np.array(motion.skeleton.parents),
         fps=np.float64(motion.fps),
+        **performed,
     )
 
 

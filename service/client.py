@@ -7,6 +7,7 @@ ClientError                 the service did not answer with a prediction
 └── ConnectionFailedError   there was no answer
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -59,6 +60,32 @@ class Prediction:
     warnings: tuple[str, ...]
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ActionSegment:
+    """The frames ``start`` to before ``end`` of a future, in which one action is performed.
+
+    ``stopped`` is false where the action was cut off.
+    """
+
+    action: str
+    start: int
+    end: int
+    stopped: bool
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class ActionsPrediction:
+    """Futures as ``Prediction`` has them, each as long as its actions took."""
+
+    futures: tuple[Float[np.ndarray, "_ J 3"], ...]
+    segments: tuple[tuple[ActionSegment, ...], ...]
+    joints: tuple[str, ...]
+    fps: float
+    seed: int
+    model: str
+    warnings: tuple[str, ...]
+
+
 class Client:
     """Asks one server; a context manager that closes its connections."""
 
@@ -97,23 +124,43 @@ class Client:
             ServerFailedError: the server is at fault.
             ConnectionFailedError: there was no answer.
         """
-        frames = [
-            [None if np.isnan(joint).any() else joint.tolist() for joint in frame]
-            for frame in poses
-        ]
-        content = self._send("POST", "/predict", {"poses": frames, **options})
+        content = self._send("POST", "/predict", {"poses": _frames(poses), **options})
         return Prediction(
-            futures=np.array(content["futures"], dtype=np.float64),
-            joints=tuple(content["joints"]),
-            fps=content["fps"],
-            seed=content["seed"],
-            model=content["model"]["name"],
-            warnings=tuple(content["warnings"]),
+            futures=np.array(content["futures"], dtype=np.float64), **_envelope(content)
+        )
+
+    def predict_actions(
+        self, poses: Float[np.ndarray, "T J 3"], actions: Sequence[str], **options: Any
+    ) -> ActionsPrediction:
+        """Futures of the poses, in which the person performs the actions one after the other.
+
+        Options are the other fields of ``POST /predict_actions``: skeleton, axes, fps, num_samples,
+        seed, model, bone_lengths, stop_threshold, max_seconds_per_action.
+
+        Raises:
+            BadRequestError: the request is at fault.
+            ServerFailedError: the server is at fault.
+            ConnectionFailedError: there was no answer.
+        """
+        body = {"poses": _frames(poses), "actions": list(actions), **options}
+        content = self._send("POST", "/predict_actions", body)
+        futures = content["futures"]
+        return ActionsPrediction(
+            futures=tuple(np.array(future["poses"], dtype=np.float64) for future in futures),
+            segments=tuple(
+                tuple(ActionSegment(**segment) for segment in future["segments"])
+                for future in futures
+            ),
+            **_envelope(content),
         )
 
     def models(self) -> dict[str, Any]:
         """What ``GET /models`` says."""
         return self._send("GET", "/models")
+
+    def actions(self) -> dict[str, Any]:
+        """What ``GET /actions`` says."""
+        return self._send("GET", "/actions")
 
     def _send(
         self, method: str, path: str, content: dict[str, Any] | None = None
@@ -132,6 +179,22 @@ class Client:
             raise kind(response.status_code, _problem(response))
         answer: dict[str, Any] = orjson.loads(response.content)
         return answer
+
+
+def _frames(poses: Float[np.ndarray, "T J 3"]) -> list[list[list[float] | None]]:
+    return [
+        [None if np.isnan(joint).any() else joint.tolist() for joint in frame] for frame in poses
+    ]
+
+
+def _envelope(content: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "joints": tuple(content["joints"]),
+        "fps": content["fps"],
+        "seed": content["seed"],
+        "model": content["model"]["name"],
+        "warnings": tuple(content["warnings"]),
+    }
 
 
 def _problem(response: httpx.Response) -> dict[str, Any]:

@@ -11,7 +11,9 @@ ServiceError                       status  problem
 │       ├── PosesError             422     invalid-poses
 │       ├── TooFewFramesError      422     too-few-frames
 │       ├── UnknownSkeletonError   422     unknown-skeleton
-│       └── UnknownModelError      422     unknown-model (404 in a path)
+│       ├── UnknownModelError      422     unknown-model (404 in a path)
+│       ├── UnsuitableModelError   422     unsuitable-model: it performs actions, or performs none
+│       └── UnknownActionError     422     unknown-action
 ├── UnavailableError               503     unavailable: loading, stopping or refused bundle
 └── EngineError                    500     prediction-failed
     ├── GraphError                 500     a graph could not run
@@ -127,6 +129,20 @@ class UnknownModelError(FieldError):
 
     slug = "unknown-model"
     title = "The model is not known"
+
+
+class UnsuitableModelError(FieldError):
+    """The bundle performs actions where none are asked for, or performs none where they are."""
+
+    slug = "unsuitable-model"
+    title = "The model does not answer such requests"
+
+
+class UnknownActionError(FieldError):
+    """The bundle knows no action of this label."""
+
+    slug = "unknown-action"
+    title = "The action is not known"
 
 
 class UnavailableError(ServiceError):

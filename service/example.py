@@ -1,4 +1,4 @@
-"""A request that works: a person who stands, for the OpenAPI document."""
+"""Requests that work: a person who stands, for the OpenAPI document."""
 
 from typing import Any
 
@@ -18,3 +18,4 @@ EXAMPLE: dict[str, Any] = {
     "num_samples": 3,
     "seed": 7,
 }
+ACTIONS_EXAMPLE = EXAMPLE | {"actions": ["walk", "wave-both-hands"]}

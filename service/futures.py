@@ -1,5 +1,8 @@
 """The engine's futures as the caller's answer: skeleton, bones, rate, world, axes and units."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+from math import ceil
 from typing import Literal
 
 import numpy as np
@@ -10,6 +13,7 @@ from models.motion.kinematics import fit_bone_lengths, rotate_yaw, yaw
 from models.motion.motion import Motion
 from models.motion.skeleton import Skeleton, joint_map
 from service.axes import UNITS_PER_METRE
+from service.engine.trajectory import Segment
 from service.observation import Caller, Observation
 
 BoneLengths = Literal["observed", "free"]
@@ -23,12 +27,20 @@ def caller_futures(
     *,
     manifest: Manifest,
     bone_lengths: BoneLengths,
+    segments: Sequence[Sequence[Segment]] = (),
 ) -> Float[np.ndarray, "N Hc J 3"]:
-    """Futures in metres, +Z up, in the caller's world, skeleton and rate, from the next frame."""
+    """Futures in metres, +Z up, in the caller's world, skeleton and rate, from the next frame.
+
+    A future of ``segments`` repeats its last frame after the last of them, as ``Result`` does.
+    """
     caller = observation.caller
     last = observation.positions[-1].astype(np.float64)
     skeleton = manifest.skeleton.skeleton()
-    paths = _at_rate(futures.astype(np.float64), last, skeleton, manifest=manifest, fps=caller.fps)
+    paths = futures.astype(np.float64)
+    if caller.fps != manifest.fps:
+        ends = [parts[-1].end for parts in segments] or [paths.shape[1]] * len(paths)
+        trimmed = [path[:end] for path, end in zip(paths, ends, strict=True)]
+        paths = _at_rate(trimmed, last, skeleton, manifest=manifest, fps=caller.fps)
     answer = _in_skeleton(paths, last, skeleton, caller)
     if bone_lengths == "observed":
         answer = fit_bone_lengths(answer, caller.bones, caller.bone_parents)
@@ -52,30 +64,47 @@ def written(
     return rounded.astype(np.float32) if spacing < 0.5 * 10**-DECIMALS else rounded
 
 
-def num_frames(manifest: Manifest, fps: float) -> int:
-    """How many frames the bundle's horizon lasts at a rate."""
-    return max(1, round(manifest.horizon / manifest.fps * fps))
+def caller_segments(
+    segments: Sequence[Sequence[Segment]], *, manifest: Manifest, fps: float
+) -> list[list[Segment]]:
+    """The segments of each future in frames of the caller's rate; its last one ends where it does.
+
+    One that is shorter than a frame of the caller's may have none.
+    """
+
+    def at_rate(segment: Segment) -> Segment:
+        start = num_frames(segment.start, manifest=manifest, fps=fps)
+        return replace(
+            segment, start=start, end=num_frames(segment.end, manifest=manifest, fps=fps)
+        )
+
+    return [[at_rate(segment) for segment in parts] for parts in segments]
+
+
+def num_frames(frames: int, *, manifest: Manifest, fps: float) -> int:
+    """How many frames at a rate last as long as some of the bundle's; one at least, of any."""
+    return round(frames / manifest.fps * fps) or min(frames, 1)
 
 
 def _at_rate(
-    futures: Float[np.ndarray, "N H Jb 3"],
+    futures: Sequence[Float[np.ndarray, "_ Jb 3"]],
     last: Float[np.ndarray, "Jb 3"],
     skeleton: Skeleton,
     *,
     manifest: Manifest,
     fps: float,
 ) -> Float[np.ndarray, "N Hc Jb 3"]:
-    if fps == manifest.fps:
-        return futures
-    count = num_frames(manifest, fps)
-    resampled = []
-    for future in futures:
-        # From the last frame seen, and a frame beyond the end: rounding may ask for half of one.
-        beyond = 2.0 * future[-1] - (future[-2] if len(future) > 1 else last)
-        path = np.concatenate([last[None], future, beyond[None]])
+    counts = [num_frames(len(future), manifest=manifest, fps=fps) for future in futures]
+    resampled = np.empty((len(futures), max(counts), *last.shape))
+    # From the last frame seen, straight on for a frame beyond the end: rounding may ask for it.
+    beyond = np.arange(1, ceil(manifest.fps / fps) + 1)[:, None, None]
+    for row, future, count in zip(resampled, futures, counts, strict=True):
+        speed = future[-1] - (future[-2] if len(future) > 1 else last)
+        path = np.concatenate([last[None], future, future[-1] + beyond * speed])
         motion = Motion(name="future", skeleton=skeleton, positions=path, fps=manifest.fps)
-        resampled.append(motion.resample(fps).positions[1 : count + 1])
-    return np.stack(resampled)
+        row[:count] = motion.resample(fps).positions[1 : count + 1]
+        row[count:] = row[count - 1]
+    return resampled
 
 
 def _in_skeleton(

@@ -5,11 +5,13 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, WithJsonSchema
 
 from service.axes import Units, Up
-from service.example import EXAMPLE
+from service.example import ACTIONS_EXAMPLE, EXAMPLE
 from service.futures import BoneLengths
 from service.skeletons import OwnJoints
 
 MAX_SEED = 2**53 - 1  # the largest integer that every JSON reader keeps
+MAX_ACTIONS = 16
+MAX_STOP_THRESHOLD_M = 1.0
 
 _POSES_SCHEMA = {
     "type": "array",
@@ -77,10 +79,8 @@ class AxesBody(_Body):
     units: Units = "m"
 
 
-class PredictRequest(_Body):
-    """An observed motion, and how to continue it."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
+class ObservedMotion(_Body):
+    """An observed motion, and what every request may say of it and of its futures."""
 
     poses: Annotated[list[Any], WithJsonSchema(_POSES_SCHEMA)]
     skeleton: SkeletonField | None = Field(
@@ -91,9 +91,6 @@ class PredictRequest(_Body):
         default=None, ge=5, le=300, description="frames per second; the model's by default"
     )
     num_samples: int = Field(default=10, ge=1, description="how many futures")
-    num_steps: int | None = Field(
-        default=None, ge=1, description="stop after so many of the model's denoising steps"
-    )
     seed: int | None = Field(
         default=None, ge=0, le=MAX_SEED, description="same seed, same futures; drawn by default"
     )
@@ -101,6 +98,41 @@ class PredictRequest(_Body):
     bone_lengths: BoneLengths = Field(
         default="observed",
         description="`observed` keeps the person's own; `free` is what the network said",
+    )
+
+
+class PredictRequest(ObservedMotion):
+    """An observed motion, and how to continue it."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
+
+    num_steps: int | None = Field(
+        default=None, ge=1, description="stop after so many of the model's denoising steps"
+    )
+
+
+class PredictActionsRequest(ObservedMotion):
+    """An observed motion, and the actions that the person performs next."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [ACTIONS_EXAMPLE]})
+
+    actions: list[str] = Field(
+        min_length=1,
+        max_length=MAX_ACTIONS,
+        description="labels of GET /actions, performed one after the other",
+    )
+    stop_threshold: float | None = Field(
+        default=None,
+        gt=0,
+        le=MAX_STOP_THRESHOLD_M,
+        description="metres within which the joints stay when an action has ended; a larger one "
+        "ends it sooner; the model's by default",
+    )
+    max_seconds_per_action: float | None = Field(
+        default=None,
+        gt=0,
+        description="an action that has not ended by then is cut off; at most, and by default, "
+        "the model's horizon",
     )
 
 
@@ -120,8 +152,8 @@ class Steps(_Body):
     stopped_by: Literal["end", "num_steps"]
 
 
-class PredictResponse(_Body):
-    """Futures in the caller's world, skeleton, axes, units and rate."""
+class Answer(_Body):
+    """What every answer says beside its futures."""
 
     id: str
     model: ModelRef
@@ -129,6 +161,13 @@ class PredictResponse(_Body):
     fps: float
     skeleton: str
     joints: list[str]
+    warnings: list[str]
+    timing_ms: dict[str, float]
+
+
+class PredictResponse(Answer):
+    """Futures in the caller's world, skeleton, axes, units and rate."""
+
     num_frames: int
     futures: Annotated[
         list[Any],
@@ -142,8 +181,38 @@ class PredictResponse(_Body):
         ),
     ]
     steps: Steps
-    warnings: list[str]
-    timing_ms: dict[str, float]
+
+
+class ActionSegment(_Body):
+    """The frames of a future in which one action is performed, the way into it included."""
+
+    action: str
+    start: int = Field(description="index of its first frame in the poses")
+    end: int = Field(description="index after its last frame; the next action starts here")
+    stopped: bool = Field(description="whether it ended; false where it was cut off")
+
+
+class PerformedFuture(_Body):
+    """One future, as long as its actions took."""
+
+    num_frames: int
+    poses: Annotated[
+        list[Any],
+        WithJsonSchema(
+            _POSES_SCHEMA
+            | {
+                "description": "[frames][joints][x, y, z], rounded to 0.1 mm; the first frame is "
+                "one after the last observed"
+            }
+        ),
+    ]
+    segments: list[ActionSegment]
+
+
+class PredictActionsResponse(Answer):
+    """Futures of actions in the caller's world, skeleton, axes, units and rate."""
+
+    futures: list[PerformedFuture]
 
 
 class ModelSummary(_Body):
@@ -164,6 +233,9 @@ class ModelSummary(_Body):
     horizon: int | None = None
     num_steps: int | None = None
     trajectory: str | None = None
+    actions: list[str] = Field(
+        default=[], description="labels; a model that has some answers POST /predict_actions alone"
+    )
 
 
 class ModelDetail(ModelSummary):
@@ -179,6 +251,21 @@ class Models(_Body):
 
     default: str | None
     models: list[ModelSummary]
+
+
+class Action(_Body):
+    """An action that can be asked for."""
+
+    label: str
+    example: str | None = Field(description="what a person does who performs it")
+    models: list[str] = Field(description="the models that know it")
+
+
+class Actions(_Body):
+    """The actions of this server."""
+
+    default_model: str | None = Field(description="performs them when a request names no model")
+    actions: list[Action]
 
 
 class StandardSkeleton(_Body):

@@ -25,4 +25,7 @@ class Settings(BaseSettings):
     threads: int = Field(default=2, ge=1, description="cores that one bundle computes on")
     max_samples: int = Field(default=200, ge=1)
     max_frames: int = Field(default=3000, ge=1)
+    max_poses: int = Field(
+        default=240_000, ge=1, description="of all futures of actions in one answer"
+    )
     max_body_bytes: int = Field(default=16 * 2**20, ge=1)

@@ -25,6 +25,14 @@ def walk(tmp_path: Path) -> Path:
     return file
 
 
+@pytest.fixture
+def performers(bundles_with_actions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POSEFUTURES_BUNDLES", str(bundles_with_actions))
+
+
+with_actions = pytest.mark.usefixtures("performers")
+
+
 def run(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
@@ -61,6 +69,71 @@ def test_predict_writes_npz_from_any_second(walk: Path, tmp_path: Path):
             archive["futures"][0, 0], read_bvh(walk).positions[30], atol=1e-3
         )
         assert tuple(archive["joints"]) == BODY21.joints
+
+
+@with_actions
+def test_actions_are_written_each_as_long_as_it_took(walk: Path, tmp_path: Path):
+    options = ("--actions", "reach, wave", "--seed", "5", "--num-samples", "4", "--out", tmp_path)
+    for output_format in ("bvh", "npz"):
+        result = run("predict", walk, *options, "--format", output_format)
+        assert result.exit_code == 0, result.output
+        assert "by actions, seed 5" in result.stdout
+    with np.load(tmp_path / "walk-futures.npz") as archive:
+        lengths, futures = archive["lengths"], archive["futures"]
+        assert archive["actions"].tolist() == ["reach", "wave"]
+        assert archive["segment_ends"].shape == archive["stopped"].shape == (4, 2)
+        np.testing.assert_array_equal(archive["segment_ends"][:, -1], lengths)
+        assert archive["stopped"].all()
+    assert futures.shape == (4, lengths.max(), 21, 3)
+    assert len(set(lengths)) > 1
+    for i, length in enumerate(lengths):
+        written = read_bvh(tmp_path / f"walk-future-{i}.bvh").positions
+        np.testing.assert_allclose(written, futures[i, :length], atol=1e-3)
+        assert np.all(futures[i, length:] == futures[i, length - 1])
+
+
+@with_actions
+def test_actions_are_cut_off_where_it_is_asked(walk: Path, tmp_path: Path):
+    for option in (("--max-seconds-per-action", "0.2"), ("--stop-threshold", "1")):
+        run("predict", walk, "--actions", "wave", "--format", "npz", "--out", tmp_path, *option)
+        with np.load(tmp_path / "walk-futures.npz") as archive:
+            assert set(archive["lengths"]) == {6}
+
+
+@with_actions
+def test_mistakes_about_actions_are_one_line(walk: Path):
+    def said(*options: str) -> str:
+        return one_line(run("predict", walk, *options))
+
+    assert "actions[1]: found 'weve'; must be one of reach, crouch, wave; the nearest is wave." in (
+        said("--actions", "reach,weve")
+    )
+    assert "actions[0]: found ''" in said("--actions", "")
+    assert "model: found 'still'; must be one that performs actions" in (
+        said("--actions", "wave", "--model", "still")
+    )
+    assert "predicts without actions: diffusion, still" in said("--model", "actions")
+    assert "max_seconds_per_action: found 9 s" in (
+        said("--actions", "wave", "--max-seconds-per-action", "9")
+    )
+    assert "stop_threshold: found 0 m" in said("--actions", "wave", "--stop-threshold", "0")
+    assert "stop_threshold: found 0.1 m; diffusion performs no" in said("--stop-threshold", "0.1")
+    assert "max_seconds_per_action: found 1 s" in said("--max-seconds-per-action", "1")
+
+
+def test_actions_without_a_bundle_that_performs_them_are_one_line(walk: Path):
+    assert "no bundle that performs actions" in one_line(run("predict", walk, "--actions", "wave"))
+    assert run("actions").stdout == ""
+
+
+@with_actions
+def test_actions_and_both_defaults_are_listed():
+    assert run("actions").stdout.splitlines() == [
+        "actions", "  reach", "  crouch", "  wave  raises a hand",
+    ]  # fmt: skip
+    assert [line.split("  1.0.0")[0] for line in run("models").stdout.splitlines()] == [
+        "* actions", "* diffusion", "  still",
+    ]  # fmt: skip
 
 
 def test_same_seed_writes_the_same_files(walk: Path, tmp_path: Path):
@@ -101,7 +174,9 @@ def test_flags_are_frozen():
     assert flags == {
         "serve": ["host", "port"],
         "models": [],
+        "actions": [],
         "predict": [
             "file", "num_samples", "num_steps", "model", "seed", "out", "output_format", "at",
+            "actions", "stop_threshold", "max_seconds_per_action",
         ],
     }  # fmt: skip

@@ -19,6 +19,25 @@ def test_client_gives_arrays(service: Service):
         assert client.models()["default"] == "diffusion"
 
 
+def test_client_gives_futures_of_actions_with_their_segments(performing_service: Service):
+    with Client(transport=performing_service) as client:
+        poses = walking()
+        poses[4, 8] = np.nan
+        prediction = client.predict_actions(poses, ["reach", "wave"], num_samples=4, seed=5)
+        ends = [segments[-1].end for segments in prediction.segments]
+        assert [future.shape for future in prediction.futures] == [(end, 21, 3) for end in ends]
+        assert len(set(ends)) > 1
+        reach, wave = prediction.segments[0]
+        assert (reach.action, reach.start, reach.stopped) == ("reach", 0, True)
+        assert (wave.action, wave.start) == ("wave", reach.end)
+        assert (prediction.seed, prediction.fps, prediction.model) == (5, 30.0, "actions")
+        assert "left_hand is null" in prediction.warnings[0]
+        assert client.actions()["default_model"] == "actions"
+        with pytest.raises(BadRequestError, match="the nearest is wave") as caught:
+            client.predict_actions(poses, ["weave"])
+        assert caught.value.problem["pointer"] == "/actions/0"
+
+
 def test_client_raises_what_the_server_says(service: Service):
     client = Client(transport=service)
     with pytest.raises(BadRequestError, match="found 'octopus'") as caught:

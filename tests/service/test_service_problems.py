@@ -195,6 +195,7 @@ def test_every_problem_of_the_tree_is_reached_by_these_tests():
         "malformed-body", "unsupported-media-type", "body-too-large", "not-found",
         "method-not-allowed", "prediction-failed",
         "unavailable",  # test_service_catalog
+        "unsuitable-model", "unknown-action",  # test_service_actions
     }  # fmt: skip
     abstract = {"internal", "bad-request"}
     assert family(ServiceError) - abstract == reached
