@@ -13,8 +13,10 @@ from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from models.system import Batch, Losses, Recipe, Stage, describe
+from models.system import Batch, Data, Losses, Recipe, Stage, describe
 from training.checkpoint import CHECKPOINT_FILE, load_checkpoint, save_checkpoint
+from training.data.action_batches import ActionBatches
+from training.data.batch_source import BatchSource
 from training.data.batches import Batches
 from training.data.store import Store
 
@@ -45,7 +47,7 @@ class Run:
     folder: Path
     network: nn.Module
     device: torch.device
-    batches: Batches
+    batches: BatchSource
     progress: Progress
 
 
@@ -81,13 +83,13 @@ def train(
         folder=folder,
         network=recipe.build().to(device),
         device=device,
-        batches=Batches(store, recipe.data, seed=seed),
+        batches=batches_of(store, recipe.data, seed=seed),
         progress=Progress(**state["progress"]) if state else Progress(),
     )
     if state:
         run.network.load_state_dict(state["network"])
     elif start_from:
-        run.network.load_state_dict(_weights_of(start_from, device))
+        run.network.load_state_dict(finished_weights(start_from, device))
     writer = SummaryWriter(str(folder / "tensorboard"))
     for index in range(run.progress.stage, len(recipe.stages)):
         resumed = state if state and state["progress"]["stage"] == index else None
@@ -96,6 +98,15 @@ def train(
         _save(run, None, None)
     writer.close()
     return run.network.eval()
+
+
+def batches_of(store: Store, data: Data, *, seed: int) -> BatchSource:
+    """Whole actions where a recipe asks for them, else windows.
+
+    Raises:
+        StoreError: the store does not fit the recipe.
+    """
+    return (ActionBatches if data.actions else Batches)(store, data, seed=seed)
 
 
 def trained_network(recipe: Recipe, folder: Path | None) -> tuple[nn.Module, Progress]:
@@ -121,10 +132,16 @@ def trained_network(recipe: Recipe, folder: Path | None) -> tuple[nn.Module, Pro
     return network.eval(), progress
 
 
-def _weights_of(folder: Path, device: torch.device) -> dict[str, Tensor]:
+def finished_weights(folder: Path, device: torch.device) -> dict[str, Tensor]:
+    """The weights of a finished run.
+
+    Raises:
+        CheckpointError: there is no checkpoint.
+        RunError: the run is not finished.
+    """
     state = load_checkpoint(folder, device)
     if "optimiser" in state:
-        raise RunError(f"{folder}: this run is not finished; a new run can start from a finished.")
+        raise RunError(f"{folder}: this run is not finished; run its own command again first.")
     weights: dict[str, Tensor] = state["network"]
     return weights
 

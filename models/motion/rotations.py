@@ -137,6 +137,12 @@ def from_axis_angles(
     return q
 
 
+def from_rotation_vectors(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 4"]:
+    """Turns about the directions of vectors, by their lengths in radians."""
+    half = np.linalg.norm(vectors, axis=-1, keepdims=True) / 2
+    return np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * vectors], axis=-1)
+
+
 def to_euler(q: Float[np.ndarray, "*batch 4"], order: str) -> Float[np.ndarray, "*batch 3"]:
     """Angles such that from_axis_angles(angles, order) is the rotation; order is like "ZXY".
 

@@ -8,13 +8,25 @@ from tiny_bundles import standing_pose
 from models.motion.kinematics import bone_lengths
 from models.motion.skeleton import BODY21, H36M17, SMPL22, Skeleton
 from models.system import Augmentation
-from training.data.augment import add_sensor_noise, augment, mirror, rotate, scale_bones
+from training.data.augment import (
+    add_sensor_noise,
+    augment,
+    draw_mirrored,
+    mirror,
+    rotate,
+    scale_bones,
+)
 from training.data.augment import warped_frames as warped
 
 
 def windows(skeleton: Skeleton = BODY21, *, count: int = 3) -> np.ndarray:
     motions = [walker(20, seed=i).to(skeleton).positions for i in range(count)]
     return np.stack(motions).astype(np.float32)
+
+
+def varied_by(how: Augmentation, poses: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    mirrored = draw_mirrored(len(poses), how=how, generator=generator)
+    return augment(poses, mirrored=mirrored, how=how, skeleton=BODY21, generator=generator)
 
 
 @pytest.mark.parametrize("skeleton", [BODY21, SMPL22, H36M17])
@@ -77,7 +89,7 @@ def test_rate_tells_how_much_of_a_clip_passes():
 def test_augmented_bodies_stay_symmetric_and_near_their_size():
     how = Augmentation(body_scale=0.05, bone_scale=0.06)
     poses = np.repeat(standing_pose()[None, None], 50, axis=0).astype(np.float32)
-    varied = augment(poses, how=how, skeleton=BODY21, generator=np.random.default_rng(3))
+    varied = varied_by(how, poses, np.random.default_rng(3))
     before, after = (bone_lengths(p, BODY21.parents)[:, 0, 1:] for p in (poses, varied))
     ratio = after / before
     assert 0.95 * 0.94 < ratio.min() < 0.97
@@ -87,10 +99,21 @@ def test_augmented_bodies_stay_symmetric_and_near_their_size():
     assert np.ptp(ratio, axis=1).min() > 0.01  # bones vary, not the body alone
 
 
+def test_about_half_of_the_rows_are_mirrored_and_only_those():
+    how, generator = Augmentation(yaw=False), np.random.default_rng(0)
+    mirrored = draw_mirrored(400, how=how, generator=generator)
+    assert 160 < mirrored.sum() < 240
+    poses = windows(count=3)
+    chosen = np.array([True, False, True])
+    varied = augment(poses, mirrored=chosen, how=how, skeleton=BODY21, generator=generator)
+    np.testing.assert_array_equal(varied[chosen], mirror(poses[chosen], BODY21))
+    np.testing.assert_array_equal(varied[1], poses[1])
+
+
 def test_no_augmentation_changes_nothing():
     how = Augmentation(mirror=False, yaw=False)
     poses = windows()
-    same = augment(poses, how=how, skeleton=BODY21, generator=np.random.default_rng(0))
+    same = varied_by(how, poses, np.random.default_rng(0))
     np.testing.assert_array_equal(same, poses)
 
 
@@ -98,6 +121,6 @@ def test_augmentation_leaves_its_input_alone():
     poses = windows()
     kept = poses.copy()
     how = Augmentation(body_scale=0.05, bone_scale=0.06)
-    augment(poses, how=how, skeleton=BODY21, generator=np.random.default_rng(0))
+    varied_by(how, poses, np.random.default_rng(0))
     add_sensor_noise(poses, deviation_m=0.01, generator=np.random.default_rng(0))
     np.testing.assert_array_equal(poses, kept)

@@ -1,7 +1,7 @@
 """Variations of training windows that keep them human: time, mirror, yaw, body, sensor noise."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from models.motion.skeleton import Skeleton
 from models.system import Augmentation
@@ -45,14 +45,28 @@ def scale_bones(poses: Poses, factors: Float[np.ndarray, "B J"], parents: tuple[
     return scaled
 
 
+def draw_mirrored(
+    count: int, *, how: Augmentation, generator: np.random.Generator
+) -> Bool[np.ndarray, "count"]:
+    """Which of some windows are to be mirrored: every other one, by chance, or none."""
+    return generator.random(count) < 0.5 if how.mirror else np.zeros(count, dtype=bool)
+
+
 def augment(
-    poses: Poses, *, how: Augmentation, skeleton: Skeleton, generator: np.random.Generator
+    poses: Poses,
+    *,
+    mirrored: Bool[np.ndarray, "B"],
+    how: Augmentation,
+    skeleton: Skeleton,
+    generator: np.random.Generator,
 ) -> Poses:
-    """A varied copy of windows that already have their playing rate."""
+    """A varied copy of windows that already have their playing rate.
+
+    Who knows what else a mirror image changes draws ``mirrored``, as `draw_mirrored` does.
+    """
     batch = len(poses)
-    if how.mirror:
-        flip = generator.random(batch) < 0.5
-        poses = np.where(flip[:, None, None, None], mirror(poses, skeleton), poses)
+    poses = poses.copy()
+    poses[mirrored] = mirror(poses[mirrored], skeleton)
     if how.yaw:
         poses = rotate(poses, generator.uniform(-np.pi, np.pi, batch))
     if how.body_scale or how.bone_scale:

@@ -1,19 +1,15 @@
-"""An endless source of augmented batches, the same for the same seed and start."""
-
-import queue
-import threading
-from collections.abc import Generator
+"""Batches of windows, and how any window becomes a row of a batch."""
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from models.system import Data
-from training.data.augment import add_sensor_noise, augment, warped_frames
+from training.data.augment import add_sensor_noise, augment, draw_mirrored, warped_frames
+from training.data.batch_source import BatchSource
 from training.data.store import ClipRecord, Store, StoreError, select
 from training.data.windows import Windows
-
-TAKEN_AHEAD = 4
 
 
 def training_clips(store: Store, data: Data) -> tuple[ClipRecord, ...]:
@@ -24,12 +20,48 @@ def training_clips(store: Store, data: Data) -> tuple[ClipRecord, ...]:
     return tuple(c for c in wanted if c not in held_out and c.source.startswith(sources))
 
 
-class Batches:
-    """Draws window, rate and variation of each row from one generator per batch number.
+def require_fit(store: Store, data: Data) -> None:
+    """Refuses a store of another skeleton or frame rate than the recipe's.
 
-    Batch number n is a pure function of (seed, n), so a resumed run sees what an uninterrupted
-    one would have seen.
+    Raises:
+        StoreError: they differ.
     """
+    if (store.skeleton.joints, store.fps) != (data.skeleton.joints, data.fps):
+        raise StoreError(
+            f"store: found {store.skeleton.name} at {store.fps} fps; the recipe needs "
+            f"{data.skeleton.name} at {data.fps} fps; prepare a store for it."
+        )
+
+
+def varied_rows(
+    poses: Float[np.ndarray, "B L J 3"],
+    *,
+    mirrored: Bool[np.ndarray, "B"],
+    data: Data,
+    generator: np.random.Generator,
+) -> dict[str, Tensor]:
+    """Observation, what is seen of it and future, from windows of the capture's world."""
+    last = poses[:, data.num_observed - 1, None, :1]
+    at_origin = poses - last * np.array([1, 1, 0], np.float32)  # worlds are large, windows are not
+    how = data.augmentation
+    varied = augment(
+        at_origin.astype(np.float32, copy=False),
+        mirrored=mirrored,
+        how=how,
+        skeleton=data.skeleton,
+        generator=generator,
+    )
+    observation = np.ascontiguousarray(varied[:, : data.num_observed])
+    seen = add_sensor_noise(observation, deviation_m=how.observation_noise, generator=generator)
+    return {
+        "observation": torch.from_numpy(observation),
+        "seen": torch.from_numpy(seen),
+        "future": torch.from_numpy(np.ascontiguousarray(varied[:, data.num_observed :])),
+    }
+
+
+class Batches(BatchSource):
+    """Draws window, rate and variation of each row from one generator per batch number."""
 
     def __init__(self, store: Store, data: Data, *, seed: int) -> None:
         """Index the windows.
@@ -37,11 +69,7 @@ class Batches:
         Raises:
             StoreError: skeleton or frame rate of store and recipe differ, or nothing is left.
         """
-        if (store.skeleton.joints, store.fps) != (data.skeleton.joints, data.fps):
-            raise StoreError(
-                f"store: found {store.skeleton.name} at {store.fps} fps; the recipe needs "
-                f"{data.skeleton.name} at {data.fps} fps; prepare a store for it."
-            )
+        require_fit(store, data)
         self._data = data
         self._seed = seed
         self._positions = np.asarray(store.positions)
@@ -64,45 +92,5 @@ class Batches:
         first = self.windows.starts[drawn][:, None] + whole
         last = self.windows.starts[drawn][:, None] + np.minimum(whole + 1, room[:, None] - 1)
         poses = self._positions[first] * (1 - fraction) + self._positions[last] * fraction
-        poses = poses - poses[:, data.num_observed - 1, :1][:, None] * np.array(
-            [1, 1, 0], np.float32
-        )  # worlds are large, windows are not
-        poses = augment(
-            poses.astype(np.float32),
-            how=how,
-            skeleton=data.skeleton,
-            generator=generator,
-        )
-        observation = np.ascontiguousarray(poses[:, : data.num_observed])
-        seen = add_sensor_noise(observation, deviation_m=how.observation_noise, generator=generator)
-        return {
-            "observation": torch.from_numpy(observation),
-            "seen": torch.from_numpy(seen),
-            "future": torch.from_numpy(np.ascontiguousarray(poses[:, data.num_observed :])),
-        }
-
-    def stream(self, *, first: int, size: int) -> Generator[dict[str, Tensor], None, None]:
-        """Batches from number ``first`` on, made ahead by a thread."""
-        ready: queue.Queue[dict[str, Tensor]] = queue.Queue(TAKEN_AHEAD)
-        stop = threading.Event()
-
-        def fill() -> None:
-            number = first
-            while not stop.is_set():
-                batch = self.batch(number, size)
-                number += 1
-                while not stop.is_set():
-                    try:
-                        ready.put(batch, timeout=0.2)
-                        break
-                    except queue.Full:
-                        continue
-
-        thread = threading.Thread(target=fill, daemon=True)
-        thread.start()
-        try:
-            while True:
-                yield ready.get()
-        finally:
-            stop.set()
-            thread.join()
+        mirrored = draw_mirrored(size, how=how, generator=generator)
+        return varied_rows(poses, mirrored=mirrored, data=data, generator=generator)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from models.motion.formats.files import read_motion
 from models.motion.formats.h36m import holds_h36m, read_h36m
+from models.motion.formats.labelled_smpl import holds_labelled_smpl, read_labelled_smpl
 from models.motion.formats.npz import Clip, read_archive
 from models.motion.motion import Motion
 
@@ -66,6 +67,8 @@ def read_takes(path: Path) -> Iterator[Take]:
     """
     if path.suffix.lower() == ".npz" and holds_h36m(path):
         yield from (_of_h36m(subject, motion) for subject, motion in read_h36m(path))
+    elif path.suffix.lower() == ".npz" and holds_labelled_smpl(path):
+        yield from (_labelled(path, action, motion) for action, motion in read_labelled_smpl(path))
     elif path.suffix.lower() == ".npz":
         yield from (_archived(clip) for clip in read_archive(path))
     else:
@@ -85,6 +88,13 @@ def _of_h36m(subject: str, motion: Motion) -> Take:
     split = "test" if subject in H36M_TEST_SUBJECTS else "train"
     action = motion.name.removeprefix(f"{subject}_").rstrip("_0123456789")
     return Take(motion=motion, split=split, source="h36m", action=action, subject=subject)
+
+
+def _labelled(path: Path, action: str, motion: Motion) -> Take:
+    """A take of a file such as ``grab_100_501_wact_candi_train.npz``."""
+    words = path.stem.split("_")
+    split = words[-1] if words[-1] in ("train", "test") else split_of(motion.name)
+    return Take(motion=motion, split=split, source=words[0], action=action)
 
 
 def take_fields(path: Path) -> dict[str, str]:

@@ -1,16 +1,12 @@
 """``data_3d_h36m.npz``, the file in which the field passes Human3.6M on, in both of its layouts."""
 
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from models.motion.formats.errors import (
-    InvalidNumberError,
-    MalformedFileError,
-    UnsupportedFileError,
-)
+from models.motion.formats.errors import InvalidNumberError, UnsupportedFileError
+from models.motion.formats.pickled import holds_key, read_dictionary
 from models.motion.motion import Motion
 from models.motion.skeleton import H36M17
 
@@ -21,11 +17,7 @@ KEPT_OF_32 = (0, 1, 2, 3, 6, 7, 8, 12, 13, 14, 15, 17, 18, 19, 25, 26, 27)
 
 def holds_h36m(path: Path) -> bool:
     """Whether an npz file has the key of this format; damaged files have not."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return f"{KEY}.npy" in archive.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return False
+    return holds_key(path, KEY)
 
 
 def read_h36m(path: Path) -> Iterator[tuple[str, Motion]]:
@@ -36,18 +28,10 @@ def read_h36m(path: Path) -> Iterator[tuple[str, Motion]]:
 
     Raises:
         UnsupportedFileError: the file holds another number of joints.
-        MalformedFileError: it is not a dictionary of arrays.
+        MalformedFileError: it is damaged or not a dictionary.
         InvalidNumberError: a value is not finite.
     """
-    with np.load(path, allow_pickle=True) as archive:
-        subjects = archive[KEY].item()
-    if not isinstance(subjects, dict):
-        raise MalformedFileError(
-            f"{path.name}: {KEY}",
-            found=type(subjects).__name__,
-            right="must be a dictionary by subject",
-        )
-    for subject, actions in subjects.items():
+    for subject, actions in read_dictionary(path, KEY).items():
         for action, positions in actions.items():
             where = f"{path.name}: {subject}, {action}"
             poses = _joints(np.asarray(positions, np.float32), where)

@@ -125,3 +125,20 @@ def test_signs_follow_the_frame_before():
 
 def test_a_zero_quaternion_becomes_the_identity():
     np.testing.assert_array_equal(rot.normalise(np.zeros((2, 4))), [IDENTITY, IDENTITY])
+
+
+@pytest.mark.parametrize("axis", "XYZ")
+def test_a_vector_along_an_axis_is_a_turn_about_it(axis):
+    angles = np.array([-3.0, -0.4, 0.0, 1e-9, 0.7, 3.1])
+    vectors = angles[:, None] * np.eye(3)["XYZ".index(axis)]
+    turns = rot.from_rotation_vectors(vectors)
+    np.testing.assert_allclose(turns, rot.from_axis_angles(angles[:, None], axis), atol=1e-15)
+
+
+@given(seeds)
+def test_a_turn_keeps_its_vector_and_follows_it_from_frame_to_frame(seed):
+    vectors = np.random.default_rng(seed).normal(size=(6, 3))
+    turns, turned = rot.from_rotation_vectors(vectors), quaternions(seed, 6)
+    np.testing.assert_allclose(rot.rotate(turns, vectors), vectors, atol=1e-12)
+    seen = rot.from_rotation_vectors(rot.rotate(turned, vectors))
+    same(seen, rot.multiply(rot.multiply(turned, turns), rot.conjugate(turned)))
