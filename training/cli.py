@@ -17,13 +17,15 @@ from models.motion.formats.errors import FormatError
 from models.motion.skeleton import SKELETONS
 from models.system import Recipe
 from service.errors import ServiceError
+from training.action_classifier import classifier_recipe, read_judge
 from training.checkpoint import CheckpointError
-from training.contact_sheet import contact_sheet
+from training.contact_sheet import action_sheet, contact_sheet
 from training.data.batches import training_clips
 from training.data.prepare import PrepareError, prepare
 from training.data.store import StoreError, open_store, select
 from training.data.windows import Windows, cut
 from training.evaluate import EvaluateError, evaluate
+from training.evaluate_actions import evaluate_actions
 from training.export import ExportError, Label, export
 from training.loop import RunError, train, trained_network
 
@@ -47,6 +49,8 @@ RecipeArgument = Annotated[
     str, typer.Argument(help="Dotted path and name, such as models.systems.NAME.recipes:mocap.")
 ]
 StoreOption = Annotated[Path, typer.Option(help="Folder made by prepare.")]
+BundlesArgument = Annotated[list[Path], typer.Argument(help="Folders of bundles to compare.")]
+SeedOption = Annotated[int, typer.Option(help="Of the samples.")]
 
 
 class RecipeError(Exception):
@@ -171,7 +175,7 @@ def _some_observations(recipe: Recipe, store: Path) -> np.ndarray:
 
 @app.command("evaluate")
 def evaluate_command(
-    bundles: Annotated[list[Path], typer.Argument(help="Folders of bundles to compare.")],
+    bundles: BundlesArgument,
     store: StoreOption,
     out: Annotated[Path, typer.Option(help="Folder for evaluation.json and evaluation.md.")],
     group: Annotated[
@@ -182,14 +186,13 @@ def evaluate_command(
     num_steps: Annotated[int | None, typer.Option(help="Stop after so many steps.")] = None,
     stride: Annotated[int, typer.Option(help="Frames between windows.")] = 10,
     max_windows: Annotated[int, typer.Option(help="Windows of a group at most.")] = 300,
-    seed: Annotated[int, typer.Option(help="Of the samples.")] = 0,
+    seed: SeedOption = 0,
     sheet: Annotated[Path | None, typer.Option(help="Also draw ten windows to this PNG.")] = None,
 ) -> None:
     """Measure bundles through the service's own engine, beside reference forecasts."""
     started = time.monotonic()
     opened = open_store(store)
     groups = dict(_group(text) for text in group)
-    command = f"posefutures-train {shlex.join(sys.argv[1:])}"
     table = evaluate(
         [(folder, read_manifest(folder)) for folder in bundles],
         opened,
@@ -200,7 +203,7 @@ def evaluate_command(
         stride=stride,
         max_windows=max_windows,
         seed=seed,
-        command=command,
+        command=_command(),
     )
     typer.echo(table)
     if sheet:
@@ -208,8 +211,67 @@ def evaluate_command(
     typer.echo(f"{time.monotonic() - started:.0f} s", err=True)
 
 
+def _command() -> str:
+    return f"posefutures-train {shlex.join(sys.argv[1:])}"
+
+
 def _group(text: str) -> tuple[str, tuple[str, ...]]:
     name, _, selectors = text.partition(":")
     if not selectors:
         raise StoreError(f"group: found {text!r}; must be name:selector[,selector…].")
     return name, tuple(selectors.split(","))
+
+
+@app.command("classifier")
+def classifier_command(
+    recipe: RecipeArgument,
+    store: StoreOption,
+    out: Annotated[Path, typer.Option(help="Folder of the run; a killed run continues there.")],
+    updates: Annotated[int, typer.Option(help="Steps of training.")] = 1_000,
+) -> None:
+    """Train the classifier that judges a recipe's actions, on the clips that the recipe learns."""
+    train(
+        classifier_recipe(load_recipe(recipe), num_updates=updates),
+        open_store(store),
+        out,
+        device=torch.device("cpu"),
+    )
+
+
+@app.command("evaluate-actions")
+def evaluate_actions_command(
+    bundles: BundlesArgument,
+    store: StoreOption,
+    classifier: Annotated[Path, typer.Option(help="Folder of a finished run of classifier.")],
+    out: Annotated[Path, typer.Option(help="Folder for evaluation_actions.json and .md.")],
+    hold: Annotated[
+        list[str] | None,
+        typer.Option(help="Clips to evaluate on; those that the recipe held out if none."),
+    ] = None,
+    samples: Annotated[int, typer.Option(help="Futures of each history and action.")] = 10,
+    histories: Annotated[int, typer.Option(help="Beginnings of clips to continue.")] = 60,
+    actions_in_sequence: Annotated[int, typer.Option(help="Performed one after another.")] = 5,
+    seed: SeedOption = 0,
+    sheet: Annotated[Path | None, typer.Option(help="Also draw every action to this PNG.")] = None,
+) -> None:
+    """Measure bundles that perform actions through the service's own engine, beside real clips."""
+    started = time.monotonic()
+    opened = open_store(store)
+    judge = read_judge(classifier, opened)
+    evaluation = evaluate_actions(
+        [(folder, read_manifest(folder)) for folder in bundles],
+        opened,
+        judge,
+        out=out,
+        hold=hold or (),
+        num_samples=samples,
+        num_histories=histories,
+        actions_in_sequence=actions_in_sequence,
+        seed=seed,
+        command=_command(),
+    )
+    typer.echo(evaluation)
+    if sheet:
+        held_out = select(opened.clips, tuple(hold or judge.data.hold_out))
+        action_sheet(bundles[0], opened, held_out, sheet, seed=seed)
+    typer.echo(f"{time.monotonic() - started:.0f} s", err=True)

@@ -18,11 +18,13 @@ from models.motion.kinematics import rotate_yaw, yaw
 from models.motion.skeleton import Skeleton
 from service.engine.engine import Engine
 from service.engine.runner import Runner
+from service.engine.trajectory import Request
 from training.data.store import ClipRecord, Store
 from training.data.windows import Windows, cut
 from training.predictors import BundlePredictor
 
 NUM_WINDOWS, NUM_SAMPLES, NUM_TIMES = 10, 3, 5
+SAMPLES = tuple(f"sample {i}" for i in range(NUM_SAMPLES))
 PALETTE = 32
 STILL_M, SPREAD_M = 0.5, 0.7  # who moves less is drawn once more at every time, so far apart
 NEAR, FAR = "tab:blue", "tab:orange"  # the left and the right side of the body
@@ -58,14 +60,60 @@ def contact_sheet(
         clip = clips[windows.clip_index[index]]
         futures = np.concatenate([window[None, num_observed:], answer["observed"]])
         side = _from_the_side(window[num_observed - 1], futures, times, store.skeleton)
-        for axes, path in zip(row, side, strict=True):
-            _draw(axes, path, store.skeleton)
-            axes.set_xlim(side[..., 0].min() - 0.2, side[..., 0].max() + 0.2)
-            axes.set_ylim(side[..., 1].min() - 0.1, side[..., 1].max() + 0.1)
+        _draw_row(row, side, store.skeleton)
         row[0].set_ylabel(f"{clip.action or clip.name}\n{clip.style or clip.subject}", fontsize=8)
-    for axes, title in zip(
-        grid[0], ["true", *(f"sample {i}" for i in range(NUM_SAMPLES))], strict=True
-    ):
+    _save(figure, grid[0], ["true", *SAMPLES], out)
+
+
+def action_sheet(
+    bundle: Path, store: Store, clips: Sequence[ClipRecord], out: Path, *, seed: int = 0
+) -> None:
+    """Draw three sampled futures of every action after the beginning of the first clip.
+
+    Each is shown at five times, evenly spread over its own length, which stands below it.
+
+    Raises:
+        StoreError: none of the clips is long enough.
+        BundleError: the bundle cannot be used.
+    """
+    manifest = read_manifest(bundle)
+    labels = manifest.actions.labels if manifest.actions else ()
+    windows = Windows.of(tuple(clips), num_frames=manifest.num_observed)
+    (observation,) = cut(
+        store, windows, num_frames=manifest.num_observed, indices=np.zeros(1, np.int64)
+    )
+    requests = [
+        Request(observation=observation, num_samples=NUM_SAMPLES, seed=seed, actions=(action,))
+        for action in range(len(labels))
+    ]
+    engine = Engine(Runner(manifest, bundle, threads=1))
+    figure = Figure(figsize=(16, 1.7 * len(labels)), layout="constrained")
+    grid = figure.subplots(len(labels), NUM_SAMPLES, squeeze=False)
+    for row, label, result in zip(grid, labels, engine.run(requests), strict=True):
+        ends = [segment.end for (segment,) in result.segments]
+        shown = [
+            future[np.linspace(0, end, NUM_TIMES + 1).round().astype(int)[1:] - 1]
+            for future, end in zip(result.futures, ends, strict=True)
+        ]
+        side = _from_the_side(
+            observation[-1], np.stack(shown), np.arange(NUM_TIMES), store.skeleton
+        )
+        _draw_row(row, side, store.skeleton)
+        row[0].set_ylabel(label, fontsize=8)
+        for axes, end in zip(row, ends, strict=True):
+            axes.set_xlabel(f"{end / manifest.fps:.1f} s", fontsize=8)
+    _save(figure, grid[0], SAMPLES, out)
+
+
+def _draw_row(row: np.ndarray, side: Float[np.ndarray, "N poses J 2"], skeleton: Skeleton) -> None:
+    for axes, path in zip(row, side, strict=True):
+        _draw(axes, path, skeleton)
+        axes.set_xlim(side[..., 0].min() - 0.2, side[..., 0].max() + 0.2)
+        axes.set_ylim(side[..., 1].min() - 0.1, side[..., 1].max() + 0.1)
+
+
+def _save(figure: Figure, first_row: np.ndarray, titles: Sequence[str], out: Path) -> None:
+    for axes, title in zip(first_row, titles, strict=True):
         axes.set_title(title, fontsize=9)
     out.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)

@@ -91,7 +91,7 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
         StoreError: a selector is wrong, or no clip of a group is long enough.
         EngineError: a bundle cannot be run.
     """
-    num_observed, horizon = _common_shape([manifest for _, manifest in bundles], store)
+    num_observed, horizon = common_shape([manifest for _, manifest in bundles], store)
     cutting = _Cutting(
         num_observed=num_observed, horizon=horizon, stride=stride, max_windows=max_windows
     )
@@ -99,7 +99,7 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
         _group(name, select(store.clips, tuple(chosen)), store, cutting)
         for name, chosen in groups.items()
     ]
-    data = {manifest.name: _data(manifest, store) for _, manifest in bundles}
+    data = {manifest.name: learnt_from(manifest, store) for _, manifest in bundles}
     predictors: dict[str, Predictor] = {
         REFERENCE: Extrapolation(rule=held, skeleton=store.skeleton, horizon=horizon),
         "constant velocity": Extrapolation(
@@ -137,7 +137,12 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
     return evaluation
 
 
-def _common_shape(manifests: Sequence[Manifest], store: Store) -> tuple[int, int]:
+def common_shape(manifests: Sequence[Manifest], store: Store) -> tuple[int, int]:
+    """Observed frames and horizon of bundles that are evaluated together.
+
+    Raises:
+        EvaluateError: bundles and store do not fit.
+    """
     if not manifests:
         raise EvaluateError("bundles: found none; there must be at least one to evaluate.")
     for manifest in manifests:
@@ -173,7 +178,7 @@ def _group(name: str, clips: tuple[ClipRecord, ...], store: Store, cutting: _Cut
     )
 
 
-def _data(manifest: Manifest, store: Store) -> Data | None:
+def learnt_from(manifest: Manifest, store: Store) -> Data | None:
     """Which clips a bundle was trained on; None where its manifest does not say."""
     said: dict[str, Any] | None = manifest.recipe.get("data")
     if said is None or not manifest.recipe.get("stages"):
@@ -224,7 +229,7 @@ def _group_rows(
         ):
             for kind, futures in answer.items():
                 scorers[kind].add(futures)
-        trained = _trained_on(group, store, data.get(name))
+        trained = trained_on(group.owners, store, data.get(name))
         for kind, scorer in scorers.items():
             rows[kind][name] = Row(
                 group=group.name,
@@ -238,8 +243,9 @@ def _group_rows(
         yield from (row.with_ratios(mine[REFERENCE]) for row in mine.values())
 
 
-def _trained_on(group: _Group, store: Store, data: Data | None) -> float | None:
+def trained_on(owners: Sequence[ClipRecord], store: Store, data: Data | None) -> float | None:
+    """The share of some clips that a bundle was trained on; None where that is not known."""
     if data is None:
         return None
     learnt = set(training_clips(store, data))
-    return sum(owner in learnt for owner in group.owners) / len(group.owners)
+    return sum(owner in learnt for owner in owners) / len(owners)

@@ -1,7 +1,6 @@
 """The scores of a predictor on some windows, and the table that shows them."""
 
 import dataclasses
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ from jaxtyping import Float
 
 from models.motion.skeleton import Skeleton
 from training import metrics
+from training.tables import as_json, heading, percent, table
 
 COLUMNS: tuple[tuple[str, str], ...] = (  # heading, how a row shows it
     ("predictor", "{name}"),
@@ -65,12 +65,9 @@ class Row:
         ratios = {f"{key}_ratio": self.scores[key] / reference.scores[key] for key in ERRORS}
         return dataclasses.replace(self, scores=dict(self.scores) | ratios)
 
-    def cells(self) -> list[str]:
-        """The row as the table shows it."""
-        trained = "-" if self.trained_on is None else f"{100 * self.trained_on:.0f} %"
-        return [
-            shown.format(name=self.name, trained_on=trained, **self.scores) for _, shown in COLUMNS
-        ]
+    def values(self) -> dict[str, Any]:
+        """What the table shows of the row."""
+        return {"name": self.name, "trained_on": percent(self.trained_on), **self.scores}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,21 +80,18 @@ class Evaluation:
 
     def json(self) -> str:
         """Everything, as JSON."""
-        return json.dumps(dataclasses.asdict(self), indent=1)
+        return as_json(self)
 
     def __str__(self) -> str:
         return self.markdown()
 
     def markdown(self) -> str:
         """A table for each group of windows and treatment of bones."""
-        said = ", ".join(f"{key} {value}" for key, value in self.protocol.items())
-        lines = [f"`{self.command}`", "", said + ".", "", LEGEND]
+        lines = heading(self.command, self.protocol, LEGEND)
         for group, bones in dict.fromkeys((row.group, row.bone_lengths) for row in self.rows):
             mine = [row for row in self.rows if (row.group, row.bone_lengths) == (group, bones)]
             lines += ["", f"### {group}, {mine[0].windows} windows, bone lengths {bones}", ""]
-            lines.append("| " + " | ".join(heading for heading, _ in COLUMNS) + " |")
-            lines.append("|---|" + "--:|" * (len(COLUMNS) - 1))
-            lines += ["| " + " | ".join(row.cells()) + " |" for row in mine]
+            lines += table(COLUMNS, (row.values() for row in mine))
         return "\n".join(lines) + "\n"
 
 

@@ -16,6 +16,9 @@ FLAGS = {
     | {"--machine"},
     "evaluate": {"--store", "--out", "--group", "--num-samples", "--num-steps", "--stride"}
     | {"--max-windows", "--seed", "--sheet"},
+    "classifier": {"--store", "--out", "--updates"},
+    "evaluate-actions": {"--store", "--classifier", "--out", "--hold", "--samples", "--histories"}
+    | {"--actions-in-sequence", "--seed", "--sheet"},
 }
 
 
