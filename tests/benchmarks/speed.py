@@ -20,6 +20,7 @@ from torch import Tensor
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]  # noqa: TID251 - a script, not an installed module
 
+from benchmarks._rounds import medians  # noqa: E402
 from tiny_bundles import walking  # noqa: E402
 
 from models.bundle import read_manifest  # noqa: E402
@@ -68,19 +69,6 @@ def engine_on(bundle: Path, *, num_steps: int, threads: int) -> Callable[[], np.
     seen = walking().astype(np.float32)
     request = Request(observation=seen, num_samples=NUM_SAMPLES, num_steps=num_steps, seed=1)
     return lambda: predict(engine, request).futures
-
-
-def medians(sides: dict[str, Callable[[], object]], *, rounds: int) -> dict[str, float]:
-    """Median milliseconds of each side over interleaved rounds."""
-    times: dict[str, list[float]] = {name: [] for name in sides}
-    for index in range(rounds + 1):
-        for name, run in sides.items():
-            time.sleep(0.02)  # thread pools spin after a call and would slow the next side
-            started = time.perf_counter()
-            run()
-            if index:  # the first round warms up
-                times[name].append(1e3 * (time.perf_counter() - started))
-    return {name: statistics.median(values) for name, values in times.items()}
 
 
 def cold_start(port: int) -> float:

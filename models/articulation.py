@@ -1,0 +1,268 @@
+"""Poses as joint rotations on a person's own bones, in torch."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from models.motion.skeleton import Skeleton
+from models.pose import Frame, facing
+
+STEP_M = 0.1
+HEIGHT_M = 1 / 3
+_EPSILON = 1e-8
+_FINE = 1e-3  # how much grandchildren count; all there is where siblings lie on one point
+
+
+Ends = tuple[tuple[int, ...], tuple[int, ...]]
+"""Two sets of joints, whose middles a line connects."""
+
+
+class Articulation(nn.Module):
+    """Positions to rotations relative to the parent joint and back, for any tree of joints.
+
+    A joint with several children turns with them as one rigid body; its axes follow the line
+    between its left and right children and the bones of the others. A joint with one child takes
+    the shortest swing from ``rest_direction``, where that bone lies on average (`fit`). Leaves turn
+    nothing and have no rotation. `positions` of `rotations` on `bones` gives the poses back where
+    bones keep their lengths and siblings their angles.
+    """
+
+    rest_direction: Tensor
+    path: Tensor
+
+    def __init__(self, skeleton: Skeleton) -> None:
+        super().__init__()
+        self.parents = skeleton.parents
+        self.turning = tuple(j for j, children in enumerate(skeleton.children) if children)
+        """The joints that have a rotation, parents first."""
+        self._children = skeleton.children
+        self._axes = {j: _axes(j, skeleton) for j in self.turning if len(self._children[j]) > 1}
+        self._place = {joint: i for i, joint in enumerate(self.turning)}
+        rest = torch.zeros(skeleton.num_joints, 3)  # until fitted: trunks rise, limbs hang
+        rest[:, 2] = torch.tensor([1.0 if side == "center" else -1.0 for side in skeleton.sides])
+        self.register_buffer("rest_direction", rest)
+        path = torch.eye(skeleton.num_joints)  # row j: the bones from the root to joint j
+        for joint, parent in enumerate(self.parents[1:], start=1):
+            path[joint] += path[parent]
+        path[:, 0] = 0.0
+        self.register_buffer("path", path, persistent=False)
+
+    @torch.no_grad()
+    def fit(self, poses: Float[Tensor, "B L J 3"]) -> None:
+        """Let lone children rest in their mean direction, as far as can be from where swings flip.
+
+        Args:
+            poses: many poses of many people, seen from their own frame.
+        """
+        frames: list[Tensor] = []
+        for joint in self.turning:
+            above = self._above(joint, frames, poses)
+            if joint not in self._axes:
+                (child,) = self._children[joint]
+                bone = _unit(poses[:, :, child] - poses[:, :, joint])
+                mean = torch.matmul(bone[:, :, None], above).mean(dim=(0, 1))
+                self.rest_direction[child] = _unit(mean[0])
+            frames.append(self._frame(joint, above, poses))
+
+    def rotations(self, poses: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L K 3 3"]:
+        """Rotation of every turning joint relative to its parent, the root's to the world."""
+        frames: list[Tensor] = []
+        local = []
+        for joint in self.turning:
+            above = self._above(joint, frames, poses)
+            frames.append(self._frame(joint, above, poses))
+            local.append(torch.matmul(above.transpose(-1, -2), frames[-1]))
+        return torch.stack(local, dim=2)
+
+    def bones(self, poses: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B J 3"]:
+        """Each person's bone vectors in the frame of the parent joint, means over the frames."""
+        frames: list[Tensor] = []
+        bones = [0.0 * poses[:, 0, 0]] * len(self.parents)  # zeros_like would fix the batch's size
+        for joint in self.turning:
+            frames.append(self._frame(joint, self._above(joint, frames, poses), poses))
+            for child in self._children[joint]:
+                bone = poses[:, :, child] - poses[:, :, joint]
+                if joint in self._axes:
+                    bones[child] = torch.matmul(bone[:, :, None], frames[-1])[:, :, 0].mean(dim=1)
+                else:
+                    length = bone.square().sum(dim=-1, keepdim=True).sqrt().mean(dim=1)
+                    bones[child] = length * self.rest_direction[child]
+        return torch.stack(bones, dim=1)
+
+    def positions(
+        self,
+        rotations: Float[Tensor, "B L K 3 3"],
+        bones: Float[Tensor, "B J 3"],
+        root: Float[Tensor, "B L 3"],
+    ) -> Float[Tensor, "B L J 3"]:
+        """Forward kinematics: p_j = p_parent + G_parent b_j."""
+        frames: list[Tensor] = []
+        for i, joint in enumerate(self.turning):
+            local = rotations[:, :, i]
+            frames.append(torch.matmul(self._above(joint, frames, local), local) if i else local)
+        parents = [self._place[max(parent, 0)] for parent in self.parents]
+        turned = torch.matmul(torch.stack(frames, dim=2)[:, :, parents], bones[:, None, :, :, None])
+        return root[:, :, None] + torch.matmul(self.path, turned[..., 0])
+
+    def _above(self, joint: int, frames: list[Tensor], like: Tensor) -> Tensor:
+        if joint == 0:
+            return torch.eye(3, dtype=like.dtype, device=like.device)
+        return frames[self._place[self.parents[joint]]]
+
+    def _frame(
+        self, joint: int, above: Tensor, poses: Float[Tensor, "B L J 3"]
+    ) -> Float[Tensor, "B L 3 3"]:
+        """The joint's axes in the world, as columns."""
+        if joint in self._axes:
+            across, upward = self._axes[joint]
+            left = _between(poses, *across)
+            left = _unit(left + _FINE * _between(poses, *self._beyond(*across)))
+            up = _between(poses, *upward)
+            up = _unit(up - (up * left).sum(dim=-1, keepdim=True) * left)
+            return torch.stack([_cross(left, up), left, up], dim=-1)
+        (child,) = self._children[joint]
+        bone = _unit(poses[:, :, child] - poses[:, :, joint])
+        own = torch.matmul(bone[:, :, None], above)[:, :, 0]
+        return torch.matmul(above, _swing(self.rest_direction[child], own))
+
+    def _beyond(self, start: tuple[int, ...], end: tuple[int, ...]) -> Ends:
+        """The children of two sets of joints, or these themselves where one has none."""
+        nexts = [
+            tuple(c for joint in joints for c in self._children[joint]) for joints in (start, end)
+        ]
+        return (nexts[0], nexts[1]) if all(nexts) else (start, end)
+
+
+def _axes(joint: int, skeleton: Skeleton) -> tuple[Ends, Ends]:
+    """From which joints to which its line across and its line upwards lead."""
+    children, mirror = skeleton.children[joint], skeleton.mirror
+    left = tuple(c for c in children if skeleton.sides[c] == "left" and mirror[c] in children)
+    if not left:  # no pair: any two children span the frame
+        return ((joint,), children[:1]), ((joint,), children[1:])
+    right = tuple(mirror[c] for c in left)
+    others = tuple(c for c in children if c not in left + right)
+    # Without a child between the pair, the pair's own middle points away from the joint.
+    return (right, left), ((joint,), others or left + right)
+
+
+def _between(
+    poses: Float[Tensor, "B L J 3"], start: tuple[int, ...], end: tuple[int, ...]
+) -> Float[Tensor, "B L 3"]:
+    return poses[:, :, list(end)].mean(dim=2) - poses[:, :, list(start)].mean(dim=2)
+
+
+def _unit(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
+    return vector / vector.square().sum(dim=-1, keepdim=True).add(_EPSILON**2).sqrt()
+
+
+def _cross(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
+    x, y, z = a.unbind(dim=-1)
+    u, v, w = b.unbind(dim=-1)
+    return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u], dim=-1)
+
+
+def _swing(rest: Float[Tensor, "3"], to: Float[Tensor, "B L 3"]) -> Float[Tensor, "B L 3 3"]:
+    """The shortest rotation that takes one unit vector to others: 1 + V + V V / (1 + cos)."""
+    x, y, z = _cross(rest.expand_as(to), to).unbind(dim=-1)
+    zero = 0.0 * x
+    rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
+    v = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    cosine = (rest * to).sum(dim=-1)[..., None, None]
+    eye = torch.eye(3, dtype=to.dtype, device=to.device)
+    turned: Tensor = eye + v + torch.matmul(v, v) / (1.0 + cosine).clamp(min=1e-4)
+    return turned
+
+
+def to_6d(rotations: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 6"]:
+    """The first two columns of rotation matrices (Zhou et al. 2019)."""
+    return rotations[..., :2].transpose(-1, -2).flatten(-2)
+
+
+def from_6d(values: Float[Tensor, "*B 6"]) -> Float[Tensor, "*B 3 3"]:
+    """Rotation matrices from two columns that need be neither of length 1 nor orthogonal."""
+    first = _unit(values[..., :3])
+    second = values[..., 3:]
+    second = _unit(second - (first * second).sum(dim=-1, keepdim=True) * first)
+    return torch.stack([first, second, _cross(first, second)], dim=-1)
+
+
+class ArticulatedPoses(nn.Module):
+    """Features of poses in the canonical frame: rotations, the root's height and its steps.
+
+    A frame is ``6 K`` numbers for the joints that turn, then the root's step along x and y since
+    the frame before (decimetres) and its height over the last observed root (thirds of a metre).
+    `weights` say what an error of each is worth: weighted squared errors sum up to about the
+    squared distance between two poses in metres.
+    """
+
+    weights: Tensor
+    scale: Tensor
+
+    def __init__(self, skeleton: Skeleton) -> None:
+        super().__init__()
+        self.articulation = Articulation(skeleton)
+        self.num_features = 6 * len(self.articulation.turning) + 3
+        self._pairs = facing(skeleton)
+        self.register_buffer("scale", torch.tensor([1 / STEP_M, 1 / STEP_M, 1 / HEIGHT_M]))
+        self.register_buffer("weights", torch.ones(self.num_features))
+
+    @torch.no_grad()
+    def fit(self, observation: Float[Tensor, "B T J 3"]) -> None:
+        """Set rest directions and weights to those of the people in some observations."""
+        canonical = Frame(observation, self._pairs).enter(observation)
+        self.articulation.fit(canonical)
+        bones = self.articulation.bones(canonical)
+        rest = torch.matmul(self.articulation.path, bones).mean(dim=0)
+        reach = (rest[:, None] - rest[None]).square().sum(dim=-1)  # (J, J)
+        below = self.articulation.path.T  # row j: the joints that the bone to j carries
+        for place, joint in enumerate(self.articulation.turning):
+            carried = below[joint] if joint else torch.ones_like(below[0])
+            # Two columns of a small rotation change by 4/3 angle^2, positions by 2/3 of that.
+            self.weights[6 * place : 6 * place + 6] = 0.5 * (reach[joint] * carried).sum()
+        joints = len(rest)
+        # A step that is wrong is wrong for a while: a third of a second.
+        self.weights[-3:-1] = joints * (10 * STEP_M) ** 2
+        self.weights[-1] = joints * HEIGHT_M**2
+
+    def enter(
+        self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B L J 3"]
+    ) -> Float[Tensor, "B L F"]:
+        """Features of poses that go on from the observation's last frame."""
+        frame = Frame(observation, self._pairs)
+        return self._features(frame.enter(poses), frame.enter(observation[:, -1:])[:, :, 0])
+
+    def enter_observation(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B T F"]:
+        """Features of the observation itself; its first step is taken to be as its second."""
+        canonical = Frame(observation, self._pairs).enter(observation)
+        return self._features(canonical, 2 * canonical[:, :1, 0] - canonical[:, 1:2, 0])
+
+    def bones(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B J 3"]:
+        """The observed person's bone vectors."""
+        return self.articulation.bones(Frame(observation, self._pairs).enter(observation))
+
+    def leave(
+        self,
+        observation: Float[Tensor, "B T J 3"],
+        features: Float[Tensor, "B L F"],
+        bones: Float[Tensor, "B J 3"],
+        start: Float[Tensor, "B 2"],
+    ) -> tuple[Float[Tensor, "B L J 3"], Float[Tensor, "B 2"]]:
+        """Poses in the observation's world, and where on the canonical ground the last one stands.
+
+        ``start`` is where the frame before the first stood.
+        """
+        rotations = from_6d(features[:, :, :-3].reshape(*features.shape[:2], -1, 6))
+        root = features[:, :, -3:] / self.scale
+        ground = start[:, None] + root[:, :, :2].cumsum(dim=1)
+        canonical = self.articulation.positions(
+            rotations, bones, torch.cat([ground, root[:, :, 2:]], dim=-1)
+        )
+        return Frame(observation, self._pairs).leave(canonical), ground[:, -1]
+
+    def _features(
+        self, canonical: Float[Tensor, "B L J 3"], before: Float[Tensor, "B 1 3"]
+    ) -> Float[Tensor, "B L F"]:
+        rotations = to_6d(self.articulation.rotations(canonical)).flatten(2)
+        root = canonical[:, :, 0]
+        steps = (root - torch.cat([before, root[:, :-1]], dim=1))[..., :2]
+        return torch.cat([rotations, torch.cat([steps, root[..., 2:]], dim=-1) * self.scale], dim=2)

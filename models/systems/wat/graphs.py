@@ -1,0 +1,82 @@
+"""The two graphs of a WAT bundle: an action begins, and goes on chunk by chunk."""
+
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from models.system import Graph
+from models.systems.wat.objective import WAT
+
+
+class Encoder(nn.Module):
+    """All that the chunks of an action need of observation and label."""
+
+    def __init__(self, network: WAT) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, observation: Float[Tensor, "B T J 3"], action: Int[Tensor, "B"]
+    ) -> tuple[Tensor, ...]:
+        """The prior of z, the bones, where the person stands, and the form's own tensors."""
+        poses = self.network.poses
+        observed = poses.enter_observation(observation)
+        mean, log_variance = self.network.prior(observed, action)
+        bones = poses.bones(observation)
+        beginning = 1.0 + 0.0 * mean[:, :1]  # ones_like would fix the batch's size
+        ground = 0.0 * bones[:, 0, :2]
+        own = self.network.form.begin(observed, action)
+        deviation = (0.5 * log_variance).exp()
+        return mean, deviation, bones, observed[:, -3:], beginning, ground, *own
+
+
+class Decoder(nn.Module):
+    """The next chunk of frames."""
+
+    def __init__(self, network: WAT, *, chunk_frames: int) -> None:
+        super().__init__()
+        self.network = network
+        self.chunk_frames = chunk_frames
+
+    def forward(  # noqa: PLR0913 - the tensors of the graph
+        self,
+        noise: Float[Tensor, "B D"],
+        observation: Float[Tensor, "B T J 3"],
+        mean: Float[Tensor, "B D"],
+        deviation: Float[Tensor, "B D"],
+        bones: Float[Tensor, "B J 3"],
+        latest_observed: Float[Tensor, "B 3 F"],
+        beginning: Float[Tensor, "B 1"],
+        ground: Float[Tensor, "B 2"],
+        *own: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """Poses in the world of the observation, and the tensors that the next chunk takes."""
+        z = mean + deviation * noise
+        features, carried = self.network.form.advance(z, own, self.chunk_frames)
+        features = self.network.joined(features, latest_observed, beginning)
+        future, ground = self.network.poses.leave(observation, features, bones, ground)
+        return future, 0.0 * beginning, ground, *carried
+
+
+def graphs(network: WAT, *, chunk_frames: int) -> tuple[Graph, ...]:
+    """Encoder and decoder of a trained network."""
+    kept, carried = network.form.kept, network.form.carried
+    given = ("mean", "deviation", "bones", "latest_observed", "beginning", "ground")
+    return (
+        Graph(
+            role="encoder",
+            module=Encoder(network),
+            inputs=("observation", "action"),
+            outputs=(*given, *kept, *carried),
+        ),
+        Graph(
+            role="decoder",
+            module=Decoder(network, chunk_frames=chunk_frames),
+            inputs=("noise", "observation", *given, *kept, *carried),
+            outputs=(
+                "future",
+                "next_beginning",
+                "next_ground",
+                *(f"next_{name}" for name in carried),
+            ),
+        ),
+    )

@@ -1,0 +1,173 @@
+"""WAT as one module, and its loss (Mao et al. 2022, Eqs. 2, 4 and 7)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Generator, Tensor, nn
+
+from models.articulation import ArticulatedPoses
+from models.pose import cosine_basis
+from models.system import Batch, Losses
+
+LOG_VARIANCE_LIMIT = 8.0
+HALF_WINDOW = 10
+"""L: frames on either side of the junction that must be smooth together."""
+NUM_BASES = 5
+"""M: cosines that a smooth junction consists of."""
+LENGTH_GROUPS = 3
+"""Parts of a batch, by length, so that short actions do not pay for the longest."""
+FADING_FRAMES, FADED_AFTER = 3.0, 20
+"""How fast the first frames forget where the observation was heading, and when they have."""
+
+
+class WAT(nn.Module):
+    """A conditional VAE of whole actions on articulated poses; ``form`` is either network."""
+
+    smooth: Tensor
+    fading: Tensor
+    momentum: Tensor
+
+    def __init__(self, *, poses: ArticulatedPoses, form: nn.Module) -> None:
+        super().__init__()
+        self.poses = poses
+        # Either form's: `recurrent` or `transformer`, whose classes have the same methods.
+        self.form: Any = form
+        basis = cosine_basis(NUM_BASES, 2 * HALF_WINDOW)
+        self.register_buffer("smooth", basis @ basis.T, persistent=False)
+        frame = torch.arange(FADED_AFTER, dtype=torch.float32)
+        fading = torch.exp(-frame / FADING_FRAMES)
+        self.register_buffer("fading", torch.stack([fading, frame * fading]), persistent=False)
+        momentum = torch.ones(poses.num_features)
+        momentum[-3:-1] = 0.0  # the root's steps are velocities already
+        self.register_buffer("momentum", momentum, persistent=False)
+
+    def prior(
+        self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
+    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
+        """Mean and log variance of z given what is known when a request arrives."""
+        mean, log_variance = self.form.prior(observed, action)
+        return mean, log_variance.clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
+
+    def posterior(
+        self,
+        observed: Float[Tensor, "B T F"],
+        future: Float[Tensor, "B L F"],
+        num_frames: Int[Tensor, "B"],
+        action: Int[Tensor, "B"],
+    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
+        """Mean and log variance of z given the future."""
+        mean, log_variance = self.form.posterior(observed, future, num_frames, action)
+        return mean, log_variance.clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
+
+    def joined(
+        self,
+        features: Float[Tensor, "B L F"],
+        observed: Float[Tensor, "B T F"],
+        beginning: Float[Tensor, "B 1"],
+    ) -> Float[Tensor, "B L F"]:
+        """The frames, the first two of them moved to where the observation was heading.
+
+        What they are moved by fades out over the next ones, (a + b t) exp(-t / tau), as animators
+        blend from one clip into another. ``beginning`` is 1 for rows whose action begins here.
+        """
+        heading = (observed[:, -1] - observed[:, -3]) / 2 * self.momentum
+        first = observed[:, -1] + heading - features[:, 0]
+        second = (observed[:, -1] + 2 * heading - features[:, 1]) / self.fading[0, 1]
+        moved = torch.stack([first, second - first], dim=1) * beginning[:, None]
+        count = min(features.shape[1], FADED_AFTER)
+        correction = torch.matmul(self.fading[:, :count].T, moved)
+        return torch.cat([features[:, :count] + correction, features[:, count:]], dim=1)
+
+
+@torch.no_grad()
+def fit_poses(network: WAT, next_batch: Callable[[], Batch], *, num_batches: int) -> None:
+    """Set rest directions and weights of the features to those of the data."""
+    batches = [next_batch() for _ in range(num_batches)]
+    network.poses.fit(torch.cat([batch["observation"] for batch in batches]))
+
+
+def loss(  # noqa: PLR0913 - the weights of the terms
+    network: WAT,
+    batch: Batch,
+    generator: Generator,
+    *,
+    reconstruction_weight: float,
+    smooth_weight: float,
+    step_weight: float,
+    kl_weight: float,
+    padding: int,
+) -> Losses:
+    """Eq. 6: reconstruction where the future is known, a smooth junction, KL to the prior.
+
+    Errors are weighted sums of squares over a pose's features, about its squared distance in
+    metres. ``step_weight`` counts the error of each frame's change.
+    """
+    groups = batch["length"].argsort().chunk(LENGTH_GROUPS)
+    terms = [
+        _terms(network, {name: value[rows] for name, value in batch.items()}, generator, padding)
+        for rows in groups
+    ]
+    reconstruction, step, smooth, kl = (torch.cat(term).mean() for term in zip(*terms, strict=True))
+    return {
+        "total": reconstruction_weight * reconstruction
+        + step_weight * step
+        + smooth_weight * smooth
+        + kl_weight * kl,
+        "reconstruction": reconstruction,
+        "step": step,
+        "smooth": smooth,
+        "kl": kl,
+    }
+
+
+def _terms(
+    network: WAT, batch: Batch, generator: Generator, padding: int
+) -> tuple[Float[Tensor, "B"], ...]:
+    """Each row's reconstruction error, error of steps, roughness of the junction, and KL."""
+    action, first, length = batch["action"], batch["first"], batch["length"]
+    patch = network.form.frames_per_step
+    needed = int((length + padding).max())
+    num_frames = min(-(-needed // patch) * patch, batch["future"].shape[1])
+    with torch.no_grad():
+        observed = network.poses.enter_observation(batch["seen"])
+        future = network.poses.enter(batch["observation"], batch["future"][:, :num_frames])
+    frame = torch.arange(num_frames, device=first.device)
+    # After a transition the first pose is known, but not the step that led to it.
+    known = (frame >= (first + (first > 0))[:, None]) & (frame < (length + padding)[:, None])
+    mean, log_variance = network.posterior(observed, future, length.clamp(max=num_frames), action)
+    expected = network.prior(observed, action)
+    noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+    z = mean + (0.5 * log_variance).exp() * noise
+    predicted, _ = network.form.advance(z, network.form.begin(observed, action), num_frames)
+    predicted = network.joined(predicted, observed, torch.ones_like(z[:, :1]))
+    weight = network.poses.weights.sqrt()
+    error = (predicted - future) * weight
+    window = torch.cat([observed[:, -HALF_WINDOW:], predicted[:, :HALF_WINDOW]], dim=1) * weight
+    rough = window - torch.matmul(network.smooth, window)
+    return (
+        _mean_over_known(error, known),
+        _mean_over_known(error.diff(dim=1), known[:, 1:] & known[:, :-1]),
+        rough.square().sum(dim=2).mean(dim=1),
+        _kl(mean, log_variance, *expected),
+    )
+
+
+def _mean_over_known(
+    error: Float[Tensor, "B L F"], known: Bool[Tensor, "B L"]
+) -> Float[Tensor, "B"]:
+    squared = error.square().sum(dim=2) * known
+    return squared.sum(dim=1) / known.sum(dim=1).clamp(min=1)
+
+
+def _kl(
+    mean: Float[Tensor, "B D"],
+    log_variance: Float[Tensor, "B D"],
+    prior_mean: Float[Tensor, "B D"],
+    prior_log_variance: Float[Tensor, "B D"],
+) -> Float[Tensor, "B"]:
+    """Eq. 2."""
+    difference = (mean - prior_mean).square() + log_variance.exp()
+    ratio = difference * (-prior_log_variance).exp()
+    return 0.5 * (prior_log_variance - log_variance + ratio - 1).sum(dim=1)

@@ -1,0 +1,119 @@
+"""The recurrent form (Mao et al. 2022, Fig. 3a; supplement, Table 4)."""
+
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+
+class TanhMLP(nn.Sequential):
+    """Linear layers with tanh after each."""
+
+    def __init__(self, *widths: int) -> None:
+        layers: list[nn.Module] = []
+        for narrow, wide in pairwise(widths):
+            layers += [nn.Linear(narrow, wide), nn.Tanh()]
+        super().__init__(*layers)
+
+
+class RecurrentVAE(nn.Module):
+    """Encoders and decoder of gated recurrent units; a unit sees ``frames_per_step`` frames."""
+
+    kept = ("observed_code", "action_code", "last_frame")
+    """Tensors of `begin` that stay as they are while an action goes on."""
+    carried = ("hidden", "latest_frame")
+    """Tensors of `begin` that `advance` replaces."""
+
+    def __init__(
+        self,
+        *,
+        features: int,
+        num_actions: int,
+        latent: int,
+        hidden: int,
+        widths: tuple[int, int],
+        frames_per_step: int,
+    ) -> None:
+        super().__init__()
+        self.frames_per_step = frames_per_step
+        patch = features * frames_per_step
+        self.action = nn.Embedding(num_actions, hidden)
+        self.observed = nn.GRU(patch, hidden, batch_first=True)
+        self.performed = nn.GRU(patch, hidden, batch_first=True)
+        self.prior_network = nn.Sequential(
+            TanhMLP(2 * hidden, *widths), nn.Linear(widths[-1], 2 * latent)
+        )
+        self.posterior_network = nn.Sequential(
+            TanhMLP(3 * hidden, *widths), nn.Linear(widths[-1], 2 * latent)
+        )
+        self.first_hidden = TanhMLP(hidden, hidden)
+        self.from_request = nn.Linear(2 * hidden + latent, 3 * hidden)
+        self.from_frame = nn.Linear(features, 3 * hidden, bias=False)
+        self.from_hidden = nn.Linear(hidden, 3 * hidden)
+        self.output = nn.Sequential(TanhMLP(hidden, *widths), nn.Linear(widths[-1], patch))
+        for parameter in self.output[-1].parameters():
+            nn.init.normal_(parameter, std=1e-3)
+
+    def prior(
+        self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
+    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
+        """Mean and log variance of z before the future is known."""
+        joined = torch.cat([self._code(observed), self.action(action)], dim=1)
+        mean, log_variance = self.prior_network(joined).chunk(2, dim=1)
+        return mean, log_variance
+
+    def posterior(
+        self,
+        observed: Float[Tensor, "B T F"],
+        future: Float[Tensor, "B L F"],
+        num_frames: Int[Tensor, "B"],
+        action: Int[Tensor, "B"],
+    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
+        """Mean and log variance of z after the first ``num_frames`` frames of the future."""
+        states, _ = self.performed(self._patches(future))
+        last = (num_frames - 1).div(self.frames_per_step, rounding_mode="floor")
+        seen = states[torch.arange(len(states), device=states.device), last]
+        joined = torch.cat([self._code(observed), seen, self.action(action)], dim=1)
+        mean, log_variance = self.posterior_network(joined).chunk(2, dim=1)
+        return mean, log_variance
+
+    def begin(
+        self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
+    ) -> tuple[Tensor, ...]:
+        """What `advance` takes beside z: the tensors of ``kept``, then those of ``carried``."""
+        code = self._code(observed)
+        last = observed[:, -1]
+        return code, self.action(action), last, self.first_hidden(code), last
+
+    def advance(
+        self, z: Float[Tensor, "B D"], state: tuple[Tensor, ...], num_frames: int
+    ) -> tuple[Float[Tensor, "B L F"], tuple[Tensor, ...]]:
+        """The next frames, and the tensors of ``carried`` after them."""
+        code, action, last, hidden, latest = state
+        fixed = self.from_request(torch.cat([code, action, z], dim=1))
+        patches = []
+        for _ in range(0, num_frames, self.frames_per_step):
+            hidden = self._cell(fixed + self.from_frame(latest), hidden)
+            patch = self.output(hidden).unflatten(1, (self.frames_per_step, -1)) + last[:, None]
+            latest = patch[:, -1]
+            patches.append(patch)
+        return torch.cat(patches, dim=1), (hidden, latest)
+
+    def _cell(
+        self, given: Float[Tensor, "B G"], hidden: Float[Tensor, "B H"]
+    ) -> Float[Tensor, "B H"]:
+        """A gated recurrent unit whose input was multiplied beforehand where it stays the same."""
+        reset, update, new = given.chunk(3, dim=1)
+        own_reset, own_update, own_new = self.from_hidden(hidden).chunk(3, dim=1)
+        update = torch.sigmoid(update + own_update)
+        candidate = torch.tanh(new + torch.sigmoid(reset + own_reset) * own_new)
+        return candidate + update * (hidden - candidate)
+
+    def _code(self, observed: Float[Tensor, "B T F"]) -> Float[Tensor, "B H"]:
+        states, _ = self.observed(self._patches(observed))
+        code: Tensor = states[:, -1]
+        return code
+
+    def _patches(self, frames: Float[Tensor, "B L F"]) -> Float[Tensor, "B S P"]:
+        return frames.unflatten(1, (-1, self.frames_per_step)).flatten(2)

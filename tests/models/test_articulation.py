@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+import torch
+from tiny_bundles import walking
+
+from models.articulation import ArticulatedPoses, Articulation, from_6d, to_6d
+from models.motion.kinematics import rotate_yaw
+from models.motion.skeleton import BODY21, H36M17, SMPL22, Skeleton, joint_map
+
+
+def walk(skeleton: Skeleton = BODY21, *, num_frames: int = 30) -> torch.Tensor:
+    weights, _ = joint_map(BODY21, skeleton)
+    poses = np.einsum("ij,tjx->tix", weights, walking(num_frames, fps=30.0))
+    return torch.from_numpy(poses[None].astype(np.float32))
+
+
+def bent(articulation: Articulation, *, seed: int = 0) -> torch.Tensor:
+    """Rotations far from rest, but no joint turned right round."""
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.randn(2, 4, len(articulation.turning), 6, generator=generator)
+    straight = torch.tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    return from_6d(straight + 0.3 * drawn)
+
+
+@pytest.mark.parametrize("skeleton", [BODY21, SMPL22, H36M17], ids=lambda s: s.name)
+def test_positions_of_rotations_are_the_poses(skeleton):
+    articulation = Articulation(skeleton)
+    poses = walk(skeleton)
+    # Siblings must keep their angles, as they do on a body that is made of rotations.
+    rigid = articulation.positions(
+        articulation.rotations(poses), articulation.bones(poses[:, :1]), poses[:, :, 0]
+    )
+    again = articulation.positions(
+        articulation.rotations(rigid), articulation.bones(rigid), rigid[:, :, 0]
+    )
+    torch.testing.assert_close(again, rigid, atol=2e-4, rtol=0)
+
+
+def test_bones_keep_their_length_whatever_the_rotations():
+    articulation = Articulation(BODY21)
+    bones = articulation.bones(walk())
+    poses = articulation.positions(
+        bent(articulation), bones.expand(2, -1, -1), torch.zeros(2, 4, 3)
+    )
+    parents = list(BODY21.parents[1:])
+    lengths = (poses[:, :, 1:] - poses[:, :, parents]).norm(dim=-1)
+    torch.testing.assert_close(lengths, bones[:, 1:].norm(dim=-1).expand_as(lengths))
+
+
+def test_rotations_are_rotations():
+    articulation = Articulation(BODY21)
+    rotations = articulation.rotations(walk())
+    eye = torch.eye(3).expand_as(rotations)
+    torch.testing.assert_close(rotations @ rotations.mT, eye, atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(rotations.shape[:3]))
+
+
+def test_only_the_root_turns_when_the_whole_person_does():
+    articulation = Articulation(BODY21)
+    poses = walk()
+    turned = torch.from_numpy(rotate_yaw(poses.numpy(), 0.8))
+    before, after = articulation.rotations(poses), articulation.rotations(turned)
+    torch.testing.assert_close(after[:, :, 1:], before[:, :, 1:], atol=1e-5, rtol=0)
+    assert not torch.allclose(after[:, :, 0], before[:, :, 0], atol=0.1)
+
+
+def test_siblings_on_one_point_get_their_frame_from_their_children():
+    poses = walk()
+    chest, left, right = (BODY21.index(n) for n in ("chest", "left_shoulder", "right_shoulder"))
+    poses[:, :, left] = poses[:, :, right] = poses[:, :, BODY21.index("neck")]
+    articulation = Articulation(BODY21)
+    rotations = articulation.rotations(poses)
+    again = articulation.positions(rotations, articulation.bones(poses), poses[:, :, 0])
+    torch.testing.assert_close(again[:, :, chest:], poses[:, :, chest:], atol=1e-3, rtol=0)
+
+
+def test_fit_rests_lone_bones_where_they_are_on_average():
+    articulation = Articulation(BODY21)
+    poses = walk(num_frames=1)
+    articulation.fit(poses)
+    rotations = articulation.rotations(poses)
+    alone = [i for i, j in enumerate(articulation.turning) if len(BODY21.children[j]) == 1]
+    eye = torch.eye(3).expand(1, 1, len(alone), 3, 3)
+    torch.testing.assert_close(rotations[:, :, alone], eye, atol=1e-5, rtol=0)
+
+
+def test_six_numbers_hold_a_rotation():
+    rotations = bent(Articulation(BODY21))
+    torch.testing.assert_close(from_6d(to_6d(rotations)), rotations, atol=1e-6, rtol=0)
+    torch.testing.assert_close(from_6d(3 * to_6d(rotations)), rotations, atol=1e-6, rtol=0)
+
+
+def test_poses_return_from_their_features():
+    poses = ArticulatedPoses(BODY21)
+    motion = walk(num_frames=60) + torch.tensor([3.0, -2.0, 0.0])
+    observation, future = motion[:, :15], motion[:, 15:]
+    poses.fit(observation)
+    rigid = poses.articulation.bones(observation)
+    features = poses.enter(observation, future)
+    ground = torch.zeros(1, 2)
+    again, arrived = poses.leave(observation, features, rigid, ground)
+    torch.testing.assert_close(again, future, atol=0.02, rtol=0)  # walking() is not quite rigid
+    half, between = poses.leave(observation, features[:, :20], rigid, ground)
+    rest, end = poses.leave(observation, features[:, 20:], rigid, between)
+    torch.testing.assert_close(torch.cat([half, rest], dim=1), again, atol=1e-5, rtol=0)
+    torch.testing.assert_close(end, arrived, atol=1e-5, rtol=0)
+
+
+def test_features_do_not_depend_on_where_a_person_stands_and_faces():
+    poses = ArticulatedPoses(BODY21)
+    motion = walk(num_frames=30)
+    moved = torch.from_numpy(rotate_yaw(motion.numpy(), 2.0)) + torch.tensor([1.0, 2.0, 0.5])
+    for clip in (motion, moved):
+        clip.requires_grad_(False)
+    torch.testing.assert_close(
+        poses.enter(moved[:, :15], moved[:, 15:]),
+        poses.enter(motion[:, :15], motion[:, 15:]),
+        atol=1e-4,
+        rtol=0,
+    )
+
+
+def test_weighted_error_is_about_the_squared_distance_of_the_poses():
+    poses = ArticulatedPoses(BODY21)
+    observation = walk(num_frames=15)
+    poses.fit(observation)
+    bones = poses.bones(observation)
+    features = poses.enter(observation, observation[:, -1:])
+    generator = torch.Generator().manual_seed(0)
+    ratios = []
+    for _ in range(50):
+        noise = torch.randn(features.shape, generator=generator) * 0.02
+        noise[..., -3:] = 0.0
+        error = (noise.square() * poses.weights).sum()
+        plain, _ = poses.leave(observation, features, bones, torch.zeros(1, 2))
+        moved, _ = poses.leave(observation, features + noise, bones, torch.zeros(1, 2))
+        ratios.append(float((moved - plain).square().sum() / error))
+    assert 0.4 < np.median(ratios) < 1.6
