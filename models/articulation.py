@@ -7,8 +7,10 @@ from torch import Tensor, nn
 from models.motion.skeleton import Skeleton
 from models.pose import Frame, facing
 
-STEP_M = 0.1
-HEIGHT_M = 1 / 3
+TURN_RAD, STEP_M, HEIGHT_M = 0.1, 0.1, 1 / 3
+"""What counts as 1 among the features."""
+LASTING_FRAMES = 3.0
+"""For how long a wrong step or turn is taken to stay wrong."""
 _EPSILON = 1e-8
 _FINE = 1e-3  # how much grandchildren count; all there is where siblings lie on one point
 
@@ -187,23 +189,23 @@ def from_6d(values: Float[Tensor, "*B 6"]) -> Float[Tensor, "*B 3 3"]:
 
 
 class ArticulatedPoses(nn.Module):
-    """Features of poses in the canonical frame: rotations, the root's height and its steps.
+    """Features of poses as a walker feels them: rotations, turns and steps in the own heading.
 
-    A frame is ``6 K`` numbers for the joints that turn, then the root's step along x and y since
-    the frame before (decimetres) and its height over the last observed root (thirds of a metre).
-    `weights` say what an error of each is worth: weighted squared errors sum up to about the
-    squared distance between two poses in metres.
+    A frame is ``6 K`` numbers for the joints that turn, the root's without its heading; then the
+    change of heading since the frame before, the root's step in the heading of that frame (forward,
+    left), and its height over the last observed root. `weights` say what an error of each is worth:
+    weighted squared errors sum up to about the squared distance between two poses in metres.
     """
 
     weights: Tensor
-    scale: Tensor
+    units: Tensor
 
     def __init__(self, skeleton: Skeleton) -> None:
         super().__init__()
         self.articulation = Articulation(skeleton)
-        self.num_features = 6 * len(self.articulation.turning) + 3
+        self.num_features = 6 * len(self.articulation.turning) + 4
         self._pairs = facing(skeleton)
-        self.register_buffer("scale", torch.tensor([1 / STEP_M, 1 / STEP_M, 1 / HEIGHT_M]))
+        self.register_buffer("units", torch.tensor([TURN_RAD, STEP_M, STEP_M, HEIGHT_M]))
         self.register_buffer("weights", torch.ones(self.num_features))
 
     @torch.no_grad()
@@ -219,22 +221,25 @@ class ArticulatedPoses(nn.Module):
             carried = below[joint] if joint else torch.ones_like(below[0])
             # Two columns of a small rotation change by 4/3 angle^2, positions by 2/3 of that.
             self.weights[6 * place : 6 * place + 6] = 0.5 * (reach[joint] * carried).sum()
-        joints = len(rest)
-        # A step that is wrong is wrong for a while: a third of a second.
-        self.weights[-3:-1] = joints * (10 * STEP_M) ** 2
-        self.weights[-1] = joints * HEIGHT_M**2
+        around = rest[:, :2].square().sum()  # what a turn about the root moves
+        moved = torch.stack([around, *[around.new_tensor(float(len(rest)))] * 3])
+        lasting = torch.tensor([LASTING_FRAMES, LASTING_FRAMES, LASTING_FRAMES, 1.0])
+        self.weights[-4:] = moved * (lasting.to(moved) * self.units).square()
 
     def enter(
         self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B L J 3"]
     ) -> Float[Tensor, "B L F"]:
         """Features of poses that go on from the observation's last frame."""
-        frame = Frame(observation, self._pairs)
-        return self._features(frame.enter(poses), frame.enter(observation[:, -1:])[:, :, 0])
+        frames = torch.cat([observation[:, -1:], poses], dim=1)
+        rotations, changes = self._felt(Frame(observation, self._pairs).enter(frames))
+        return torch.cat([rotations[:, 1:], changes], dim=2)
 
     def enter_observation(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B T F"]:
         """Features of the observation itself; its first step is taken to be as its second."""
         canonical = Frame(observation, self._pairs).enter(observation)
-        return self._features(canonical, 2 * canonical[:, :1, 0] - canonical[:, 1:2, 0])
+        rotations, changes = self._felt(canonical)
+        first = torch.cat([changes[:, :1, :-1], canonical[:, :1, 0, 2:] / HEIGHT_M], dim=2)
+        return torch.cat([rotations, torch.cat([first, changes], dim=1)], dim=2)
 
     def bones(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B J 3"]:
         """The observed person's bone vectors."""
@@ -245,24 +250,48 @@ class ArticulatedPoses(nn.Module):
         observation: Float[Tensor, "B T J 3"],
         features: Float[Tensor, "B L F"],
         bones: Float[Tensor, "B J 3"],
-        start: Float[Tensor, "B 2"],
-    ) -> tuple[Float[Tensor, "B L J 3"], Float[Tensor, "B 2"]]:
-        """Poses in the observation's world, and where on the canonical ground the last one stands.
+        start: Float[Tensor, "B 3"],
+    ) -> tuple[Float[Tensor, "B L J 3"], Float[Tensor, "B 3"]]:
+        """Poses in the observation's world, and heading and place of the last one.
 
-        ``start`` is where the frame before the first stood.
+        ``start`` is the canonical heading (radians) and place (x, y) of the frame before the first.
         """
-        rotations = from_6d(features[:, :, :-3].reshape(*features.shape[:2], -1, 6))
-        root = features[:, :, -3:] / self.scale
-        ground = start[:, None] + root[:, :, :2].cumsum(dim=1)
-        canonical = self.articulation.positions(
-            rotations, bones, torch.cat([ground, root[:, :, 2:]], dim=-1)
+        changes = features[:, :, -4:] * self.units
+        headings = start[:, None, 0] + changes[:, :, 0].cumsum(dim=1)
+        before = torch.cat([start[:, :1], headings[:, :-1]], dim=1)
+        cos, sin, (forward, left) = before.cos(), before.sin(), changes[:, :, 1:3].unbind(dim=2)
+        steps = torch.stack([cos * forward - sin * left, sin * forward + cos * left], dim=2)
+        ground = start[:, None, 1:] + steps.cumsum(dim=1)
+        rotations = from_6d(features[:, :, :-4].reshape(*features.shape[:2], -1, 6))
+        upright = torch.matmul(_about_z(headings.cos(), headings.sin()), rotations[:, :, 0])
+        rotations = torch.cat([upright[:, :, None], rotations[:, :, 1:]], dim=2)
+        root = torch.cat([ground, changes[:, :, 3:]], dim=2)
+        poses = Frame(observation, self._pairs).leave(
+            self.articulation.positions(rotations, bones, root)
         )
-        return Frame(observation, self._pairs).leave(canonical), ground[:, -1]
+        return poses, torch.cat([headings[:, -1:], ground[:, -1]], dim=1)
 
-    def _features(
-        self, canonical: Float[Tensor, "B L J 3"], before: Float[Tensor, "B 1 3"]
-    ) -> Float[Tensor, "B L F"]:
-        rotations = to_6d(self.articulation.rotations(canonical)).flatten(2)
+    def _felt(
+        self, canonical: Float[Tensor, "B L J 3"]
+    ) -> tuple[Float[Tensor, "B L R"], Float[Tensor, "B M 4"]]:
+        """Rotations of every frame, and what changed since the frame before from the second on."""
+        rotations = self.articulation.rotations(canonical)
+        across = rotations[:, :, 0, :2, 1]  # the root's left, seen from above
+        across = across / across.square().sum(dim=2, keepdim=True).add(_EPSILON).sqrt()
+        cos, sin = across[..., 1], -across[..., 0]
+        level = torch.matmul(_about_z(cos, -sin), rotations[:, :, 0])
+        rotations = torch.cat([level[:, :, None], rotations[:, :, 1:]], dim=2)
         root = canonical[:, :, 0]
-        steps = (root - torch.cat([before, root[:, :-1]], dim=1))[..., :2]
-        return torch.cat([rotations, torch.cat([steps, root[..., 2:]], dim=-1) * self.scale], dim=2)
+        dx, dy = (root[:, 1:, :2] - root[:, :-1, :2]).unbind(dim=2)
+        c, s = cos[:, :-1], sin[:, :-1]
+        turned = (sin[:, 1:] * c - cos[:, 1:] * s) / (cos[:, 1:] * c + sin[:, 1:] * s).clamp(
+            min=0.1
+        )
+        parts = [turned.atan(), c * dx + s * dy, c * dy - s * dx, root[:, 1:, 2]]
+        return to_6d(rotations).flatten(2), torch.stack(parts, dim=2) / self.units
+
+
+def _about_z(cos: Float[Tensor, "B L"], sin: Float[Tensor, "B L"]) -> Float[Tensor, "B L 3 3"]:
+    zero, one = 0.0 * cos, 1.0 + 0.0 * cos
+    rows = ([cos, -sin, zero], [sin, cos, zero], [zero, zero, one])
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

@@ -1,4 +1,4 @@
-"""Command line ``posefutures-train``: prepare, train, export, evaluate."""
+"""Command line ``posefutures-train``: prepare, train, export, evaluate; actions are judged too."""
 
 import importlib
 import shlex
@@ -32,7 +32,7 @@ from training.loop import RunError, train, trained_network
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="Prepare motion, train a recipe, export a bundle, evaluate bundles.",
+    help="Prepare motion, train a recipe or the judge of its actions, export and evaluate bundles.",
 )
 ERRORS = (
     BundleError,

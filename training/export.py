@@ -73,7 +73,7 @@ def export(
 
     Args:
         recipe: what the network was built from.
-        network: the trained network; it is left in evaluation mode on the CPU.
+        network: the trained network; its graphs' modules are left in evaluation mode, on the CPU.
         folder: where the bundle goes; an older one there is replaced.
         label: name, version, licence and attribution.
         card: the model card, Markdown.

@@ -46,19 +46,27 @@ def _check_actions(request: Request, manifest: Manifest) -> None:
 
 
 def _check_stop(request: Request, manifest: Manifest) -> None:
-    longest = manifest.horizon if manifest.actions else 0
-    if request.max_frames is not None and not 1 <= request.max_frames <= longest:
+    longest_s, seconds, threshold_m = (
+        manifest.horizon / manifest.fps,
+        None,
+        request.stop_threshold_m,
+    )
+    if request.max_frames is not None:
+        seconds = request.max_frames / manifest.fps
+    performs = "performs no actions"
+    if seconds is not None and not (manifest.actions and 0 < seconds <= longest_s):
+        if manifest.actions:
+            performs = f"performs an action for at most {longest_s:g} s"
         raise FieldError(
             pointer="/max_seconds_per_action",
-            found=f"{request.max_frames / manifest.fps:g} s",
-            expected=f"{manifest.name} performs an action for at most {longest / manifest.fps:g} s",
+            found=f"{seconds:g} s",
+            expected=f"{manifest.name} {performs}",
         )
-    threshold_m = request.stop_threshold_m
     if threshold_m is not None and not (manifest.actions and threshold_m > 0):
+        if manifest.actions:
+            performs = "takes a threshold above 0"
         raise FieldError(
             pointer="/stop_threshold",
             found=f"{threshold_m:g} m",
-            expected="must be above 0"
-            if manifest.actions
-            else f"{manifest.name} performs no actions",
+            expected=f"{manifest.name} {performs}",
         )

@@ -97,7 +97,7 @@ def test_poses_return_from_their_features():
     poses.fit(observation)
     rigid = poses.articulation.bones(observation)
     features = poses.enter(observation, future)
-    ground = torch.zeros(1, 2)
+    ground = torch.zeros(1, 3)
     again, arrived = poses.leave(observation, features, rigid, ground)
     torch.testing.assert_close(again, future, atol=0.02, rtol=0)  # walking() is not quite rigid
     half, between = poses.leave(observation, features[:, :20], rigid, ground)
@@ -130,9 +130,9 @@ def test_weighted_error_is_about_the_squared_distance_of_the_poses():
     ratios = []
     for _ in range(50):
         noise = torch.randn(features.shape, generator=generator) * 0.02
-        noise[..., -3:] = 0.0
+        noise[..., -4:] = 0.0
         error = (noise.square() * poses.weights).sum()
-        plain, _ = poses.leave(observation, features, bones, torch.zeros(1, 2))
-        moved, _ = poses.leave(observation, features + noise, bones, torch.zeros(1, 2))
+        plain, _ = poses.leave(observation, features, bones, torch.zeros(1, 3))
+        moved, _ = poses.leave(observation, features + noise, bones, torch.zeros(1, 3))
         ratios.append(float((moved - plain).square().sum() / error))
     assert 0.4 < np.median(ratios) < 1.6

@@ -249,7 +249,11 @@ def test_cancelled_request_frees_its_rows(actions_bundle: Path):
             "/max_seconds_per_action",
             f"found 2.5 s; actions performs an action for at most {HORIZON / FPS:g} s",
         ),
-        (request(0, stop_threshold_m=0.0), "/stop_threshold", "found 0 m; must be above 0"),
+        (
+            request(0, stop_threshold_m=0.0),
+            "/stop_threshold",
+            "found 0 m; actions takes a threshold above 0",
+        ),
         (request(0, stop_threshold_m=float("nan")), "/stop_threshold", "found nan m"),
         (request(0, num_steps=2), "/num_steps", "actions runs 1 to 1 steps"),
     ],

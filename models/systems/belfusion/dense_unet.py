@@ -33,9 +33,8 @@ class DenseUNet(nn.Module):
 
     A latent vector has no neighbourhoods, so convolutions over an arbitrary reshaping of it buy
     nothing and cost most of the time. What remains of the U-Net are its levels, its skips and
-    FiLM. The condition holds every block's scale and shift of the context, and what the context
-    alone says of the stem's and of the head's output, so that the steps only add what the noise
-    decides; it is computed once for a request. A table adds the timestep's scales and shifts.
+    FiLM. ``film`` holds every block's scale and shift of the context and is computed once for a
+    request; a table adds the timestep's.
     """
 
     def __init__(
@@ -53,35 +52,20 @@ class DenseUNet(nn.Module):
         every = [*self.falling, self.middle, *self.rising]
         self.sizes = tuple(size for block in every for size in [block.first.in_features] * 2)
         self.context_film = nn.Linear(context, sum(self.sizes))
-        self.context_stem = nn.Linear(context, widths[0])
-        self.context_head = nn.Linear(context, latent)
         self.timestep_film = nn.Embedding(num_steps, sum(self.sizes))
         nn.init.normal_(self.timestep_film.weight, std=0.1)
 
     def condition(self, context: Float[Tensor, "B C"]) -> Float[Tensor, "B M"]:
-        """The context's share of scales and shifts, of the stem and of the head."""
-        activated = F.silu(context)
-        return torch.cat(
-            [
-                self.context_film(activated),
-                self.context_stem(activated),
-                self.context_head(activated),
-            ],
-            dim=-1,
-        )
+        """The context's share of every scale and shift, computed once for a request."""
+        result: Tensor = self.context_film(F.silu(context))
+        return result
 
     def forward(
-        self,
-        x_t: Float[Tensor, "*B D"],
-        timestep: Int[Tensor, "*C"],
-        condition: Float[Tensor, "*C M"],
+        self, x_t: Float[Tensor, "*B D"], timestep: Int[Tensor, "*C"], film: Float[Tensor, "*C M"]
     ) -> Float[Tensor, "*B D"]:
         """x0."""
-        film, stem, head = condition.split(
-            [sum(self.sizes), self.stem.out_features, self.head.out_features], dim=-1
-        )
         parts = iter((film + self.timestep_film(timestep)).split(self.sizes, dim=-1))
-        h = self.stem(x_t) + stem
+        h = self.stem(x_t)
         skips = []
         for level, block in enumerate(self.falling):
             h = block(h, next(parts), next(parts))
@@ -91,5 +75,5 @@ class DenseUNet(nn.Module):
         h = self.middle(h, next(parts), next(parts))
         for block in self.rising:
             h = block(torch.cat([skips.pop(), h], dim=-1), next(parts), next(parts))
-        x0: Tensor = self.head(F.silu(self.norm(h))) + head
+        x0: Tensor = self.head(F.silu(self.norm(h)))
         return x0

@@ -14,7 +14,7 @@ from models.systems.belfusion.objective import BeLFusion
 from models.systems.belfusion.unet import PictureUNet
 
 NUM_STEPS = 10
-EVERYTHING = {"bandai": 0.6, "cmu": 0.35, "hdm05": 0.05}
+EVERYTHING = {"bandai": 0.5, "cmu": 0.45, "hdm05": 0.05}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -156,14 +156,13 @@ def mocap_held_out() -> Recipe:
     return dataclasses.replace(mocap(hold_out=hold_out), name="mocap_held_out")
 
 
-def mocap_held_out_continued() -> Recipe:
-    """A finished `mocap_held_out` goes on, latents kept."""
-    return _continued(mocap_held_out(), name="mocap_held_out_continued")
-
-
 def mocap_everything() -> Recipe:
     """What ships: a finished `mocap_held_out` goes on, on every training clip, latents kept."""
-    return _continued(mocap(), name="mocap_everything")
+    recipe = mocap()
+    denoiser = dataclasses.replace(
+        recipe.stages[-1], prepare=None, num_updates=6_000, learning_rate=4e-4
+    )
+    return dataclasses.replace(recipe, name="mocap_everything", stages=(denoiser,))
 
 
 def mocap_cmu() -> Recipe:
@@ -171,18 +170,6 @@ def mocap_cmu() -> Recipe:
     return dataclasses.replace(
         mocap(shares={"cmu": 1.0}, updates=(1_500, 500, 300, 5_000)), name="mocap_cmu"
     )
-
-
-def mocap_cmu_continued() -> Recipe:
-    """A finished `mocap_cmu` goes on, latents kept."""
-    return _continued(mocap_cmu(), name="mocap_cmu_continued")
-
-
-def _continued(recipe: Recipe, *, name: str) -> Recipe:
-    denoiser = dataclasses.replace(
-        recipe.stages[-1], prepare=None, num_updates=6_000, learning_rate=4e-4
-    )
-    return dataclasses.replace(recipe, name=name, stages=(denoiser,))
 
 
 def tiny() -> Recipe:

@@ -23,7 +23,7 @@ class Encoder(nn.Module):
         mean, log_variance = self.network.prior(observed, action)
         bones = poses.bones(observation)
         beginning = 1.0 + 0.0 * mean[:, :1]  # ones_like would fix the batch's size
-        ground = 0.0 * bones[:, 0, :2]
+        ground = 0.0 * bones[:, 0]  # heading, x, y
         own = self.network.form.begin(observed, action)
         deviation = (0.5 * log_variance).exp()
         return mean, deviation, bones, observed[:, -3:], beginning, ground, *own
@@ -46,7 +46,7 @@ class Decoder(nn.Module):
         bones: Float[Tensor, "B J 3"],
         latest_observed: Float[Tensor, "B 3 F"],
         beginning: Float[Tensor, "B 1"],
-        ground: Float[Tensor, "B 2"],
+        ground: Float[Tensor, "B 3"],
         *own: Tensor,
     ) -> tuple[Tensor, ...]:
         """Poses in the world of the observation, and the tensors that the next chunk takes."""

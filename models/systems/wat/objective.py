@@ -10,8 +10,11 @@ from torch import Generator, Tensor, nn
 from models.articulation import ArticulatedPoses
 from models.pose import cosine_basis
 from models.system import Batch, Losses
+from models.systems.wat.recurrent import Told
 
 LOG_VARIANCE_LIMIT = 8.0
+POSTERIOR_LOG_VARIANCE = -4.0
+"""Where the posterior starts: noise that hides z teaches the decoder to ignore it."""
 HALF_WINDOW = 10
 """L: frames on either side of the junction that must be smooth together."""
 NUM_BASES = 5
@@ -40,7 +43,7 @@ class WAT(nn.Module):
         fading = torch.exp(-frame / FADING_FRAMES)
         self.register_buffer("fading", torch.stack([fading, frame * fading]), persistent=False)
         momentum = torch.ones(poses.num_features)
-        momentum[-3:-1] = 0.0  # the root's steps are velocities already
+        momentum[-4:-1] = 0.0  # turns and steps are velocities already
         self.register_buffer("momentum", momentum, persistent=False)
 
     def prior(
@@ -59,6 +62,7 @@ class WAT(nn.Module):
     ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
         """Mean and log variance of z given the future."""
         mean, log_variance = self.form.posterior(observed, future, num_frames, action)
+        log_variance = log_variance + POSTERIOR_LOG_VARIANCE
         return mean, log_variance.clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
 
     def joined(
@@ -140,7 +144,11 @@ def _terms(
     expected = network.prior(observed, action)
     noise = torch.randn(mean.shape, generator=generator, device=mean.device)
     z = mean + (0.5 * log_variance).exp() * noise
-    predicted, _ = network.form.advance(z, network.form.begin(observed, action), num_frames)
+    # Each row is told a share of the frames of its own, some none at all, as at run time.
+    share = (1.5 * _uniform(len(z), generator, z) - 0.5)[:, None]
+    here = known & (_uniform(known.shape, generator, z) < share)
+    begun = network.form.begin(observed, action)
+    predicted, _ = network.form.advance(z, begun, num_frames, Told(future, here))
     predicted = network.joined(predicted, observed, torch.ones_like(z[:, :1]))
     weight = network.poses.weights.sqrt()
     error = (predicted - future) * weight
@@ -152,6 +160,10 @@ def _terms(
         rough.square().sum(dim=2).mean(dim=1),
         _kl(mean, log_variance, *expected),
     )
+
+
+def _uniform(shape: Any, generator: Generator, like: Tensor) -> Tensor:
+    return torch.rand(shape, generator=generator, device=like.device)
 
 
 def _mean_over_known(

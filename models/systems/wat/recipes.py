@@ -156,7 +156,7 @@ def grab_transformer() -> Recipe:
 
 def ntu() -> Recipe:
     """The paper's sizes and protocol on NTU RGB-D, recurrent."""
-    return _paper_recurrent("ntu", NTU, smooth_weight=20.0)
+    return _paper_recurrent("ntu", NTU, samples_per_epoch=4_000, smooth_weight=20.0)
 
 
 def ntu_transformer() -> Recipe:
@@ -166,6 +166,7 @@ def ntu_transformer() -> Recipe:
         NTU,
         feed_forward=512,
         layers=8,
+        samples_per_epoch=4_000,
         reconstruction_weight=100.0,
         smooth_weight=20.0,
     )
@@ -177,6 +178,8 @@ def babel() -> Recipe:
         "babel",
         BABEL,
         sizes={"latent": 256, "hidden": 256, "widths": (512, 256), "frames_per_step": 1},
+        samples_per_epoch=10_000,
+        batch_size=64,
         rate=1e-3,
         reconstruction_weight=50.0,
         smooth_weight=10.0,
@@ -186,7 +189,13 @@ def babel() -> Recipe:
 def babel_transformer() -> Recipe:
     """The paper's sizes and protocol on BABEL, as a Transformer."""
     return _paper_transformer(
-        "babel_transformer", BABEL, rate=1e-4, reconstruction_weight=100.0, smooth_weight=10.0
+        "babel_transformer",
+        BABEL,
+        samples_per_epoch=10_000,
+        batch_size=64,
+        rate=1e-4,
+        reconstruction_weight=100.0,
+        smooth_weight=10.0,
     )
 
 
@@ -238,10 +247,10 @@ def _tiny_data() -> Data:
         padding=10,
         chunk_frames=10,
     )
-    return Data(skeleton=BODY21, fps=30.0, num_observed=15, horizon=60, actions=actions)
+    return Data(skeleton=BODY21, fps=30.0, num_observed=15, horizon=40, actions=actions)
 
 
-def _paper_data(*, labels: tuple[str, ...], num_observed: int, horizon: int) -> Data:
+def _paper_data(*, labels: tuple[str, ...], num_observed: int, horizon: int, shortest: int) -> Data:
     return Data(
         skeleton=SMPL22,
         fps=30.0,
@@ -251,16 +260,20 @@ def _paper_data(*, labels: tuple[str, ...], num_observed: int, horizon: int) -> 
         actions=Actions(
             labels={label: (f"action={label}",) for label in labels},
             padding=50,
-            chunk_frames=horizon,
+            chunk_frames=10,
+            min_frames=shortest - num_observed,
         ),
     )
 
 
-GRAB = _paper_data(labels=("pass", "lift", "inspect", "drink"), num_observed=25, horizon=526)
+GRAB = _paper_data(
+    labels=("pass", "lift", "inspect", "drink"), num_observed=25, horizon=526, shortest=100
+)
 NTU = _paper_data(
     labels=tuple(f"{number}" for number in (6, 7, 8, 9, 22, 23, 24, 38, 80, 93, 99, 100, 102)),
     num_observed=10,
     horizon=241,
+    shortest=35,
 )
 HUMANACT12 = _paper_data(
     labels=tuple(
@@ -281,6 +294,7 @@ HUMANACT12 = _paper_data(
     ),
     num_observed=10,
     horizon=330,
+    shortest=35,
 )
 BABEL = _paper_data(
     labels=tuple(
@@ -309,6 +323,7 @@ BABEL = _paper_data(
     ),
     num_observed=10,
     horizon=340,
+    shortest=30,
 )
 
 
@@ -319,7 +334,7 @@ def _mocap_recurrent(name: str, data: Data) -> Recipe:
         "widths": (300, 200),
         "frames_per_step": FRAMES_PER_STEP,
     }
-    return _recurrent(name, data, sizes=sizes, stage=_stage(data, num_updates=4_000))
+    return _recurrent(name, data, sizes=sizes, stage=_stage(data, num_updates=5_000))
 
 
 def _mocap_transformer(name: str, data: Data) -> Recipe:
@@ -330,37 +345,24 @@ def _mocap_transformer(name: str, data: Data) -> Recipe:
         "layers": 4,
         "frames_per_step": FRAMES_PER_STEP,
     }
-    return _transformer(name, data, sizes=sizes, stage=_stage(data, num_updates=3_000, rate=5e-4))
+    return _transformer(name, data, sizes=sizes, stage=_stage(data, num_updates=5_000, rate=5e-4))
 
 
 def _paper_recurrent(
-    name: str,
-    data: Data,
-    *,
-    sizes: dict[str, Any] | None = None,
-    rate: float = 2e-3,
-    reconstruction_weight: float = 100.0,
-    smooth_weight: float = 100.0,
+    name: str, data: Data, *, sizes: dict[str, Any] | None = None, **terms: Any
 ) -> Recipe:
     sizes = sizes or {"latent": 128, "hidden": 128, "widths": (300, 200), "frames_per_step": 1}
-    return _recurrent(
-        name,
-        data,
-        sizes=sizes,
-        stage=_paper_stage(data, rate, reconstruction_weight, smooth_weight),
-    )
+    return _recurrent(name, data, sizes=sizes, stage=_paper_stage(data, **terms))
 
 
-def _paper_transformer(  # noqa: PLR0913 - the columns of Table 5
+def _paper_transformer(
     name: str,
     data: Data,
     *,
     feed_forward: int = 256,
     layers: int = 6,
     padding: int = 20,
-    rate: float = 5e-4,
-    reconstruction_weight: float = 1000.0,
-    smooth_weight: float = 100.0,
+    **terms: Any,
 ) -> Recipe:
     data = dataclasses.replace(data, actions=dataclasses.replace(_actions(data), padding=padding))
     sizes = {
@@ -370,12 +372,8 @@ def _paper_transformer(  # noqa: PLR0913 - the columns of Table 5
         "layers": layers,
         "frames_per_step": 1,
     }
-    return _transformer(
-        name,
-        data,
-        sizes=sizes,
-        stage=_paper_stage(data, rate, reconstruction_weight, smooth_weight),
-    )
+    terms = {"rate": 5e-4, "reconstruction_weight": 1_000.0} | terms
+    return _transformer(name, data, sizes=sizes, stage=_paper_stage(data, **terms))
 
 
 def _recurrent(name: str, data: Data, *, sizes: dict[str, Any], stage: Stage) -> Recipe:
@@ -415,6 +413,7 @@ def _stage(  # noqa: PLR0913 - the terms of the loss
     reconstruction_weight: float = 1_000.0,
     smooth_weight: float = 300.0,
     step_weight: float = 3_000.0,
+    kl_weight: float = 0.1,
 ) -> Stage:
     return Stage(
         name="vae",
@@ -424,7 +423,7 @@ def _stage(  # noqa: PLR0913 - the terms of the loss
             reconstruction_weight=reconstruction_weight,
             smooth_weight=smooth_weight,
             step_weight=step_weight,
-            kl_weight=1.0,
+            kl_weight=kl_weight,
             padding=_actions(data).padding,
         ),
         trains=("form",),
@@ -443,16 +442,23 @@ def _constant_then_falling(progress: float) -> float:
 
 
 def _paper_stage(
-    data: Data, rate: float, reconstruction_weight: float, smooth_weight: float
+    data: Data,
+    *,
+    samples_per_epoch: int = 1_000,
+    batch_size: int = 128,
+    rate: float = 2e-3,
+    reconstruction_weight: float = 100.0,
+    smooth_weight: float = 100.0,
 ) -> Stage:
     stage = _stage(
         data,
-        num_updates=500 * 1_000 // 128,
-        batch_size=128,
+        num_updates=500 * samples_per_epoch // batch_size,
+        batch_size=batch_size,
         rate=rate,
         reconstruction_weight=reconstruction_weight,
         smooth_weight=smooth_weight,
         step_weight=0.0,
+        kl_weight=1.0,
     )
     return dataclasses.replace(
         stage,

@@ -1,10 +1,14 @@
 """The recurrent form (Mao et al. 2022, Fig. 3a; supplement, Table 4)."""
 
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+
+CLOCK = 16
+"""Sines and cosines that tell the unit how many steps an action is old, periods 4 to 512."""
 
 
 class TanhMLP(nn.Sequential):
@@ -17,13 +21,21 @@ class TanhMLP(nn.Sequential):
         super().__init__(*layers)
 
 
+class Told(NamedTuple):
+    """True frames that a decoder in training goes on from instead of its own, where ``here``."""
+
+    future: Float[Tensor, "B L F"]
+    here: Bool[Tensor, "B L"]
+
+
 class RecurrentVAE(nn.Module):
     """Encoders and decoder of gated recurrent units; a unit sees ``frames_per_step`` frames."""
 
-    kept = ("observed_code", "action_code", "last_frame")
+    kept = ("observed_code", "action_code")
     """Tensors of `begin` that stay as they are while an action goes on."""
-    carried = ("hidden", "latest_frame")
+    carried = ("hidden", "latest_frame", "steps")
     """Tensors of `begin` that `advance` replaces."""
+    clock_rate: Tensor
 
     def __init__(
         self,
@@ -47,6 +59,9 @@ class RecurrentVAE(nn.Module):
         self.posterior_network = nn.Sequential(
             TanhMLP(3 * hidden, *widths), nn.Linear(widths[-1], 2 * latent)
         )
+        self.from_clock = nn.Linear(CLOCK, 3 * hidden, bias=False)
+        rate = torch.pi / 2 ** torch.arange(1, CLOCK // 2 + 1)
+        self.register_buffer("clock_rate", rate, persistent=False)
         self.first_hidden = TanhMLP(hidden, hidden)
         self.from_request = nn.Linear(2 * hidden + latent, 3 * hidden)
         self.from_frame = nn.Linear(features, 3 * hidden, bias=False)
@@ -83,22 +98,32 @@ class RecurrentVAE(nn.Module):
     ) -> tuple[Tensor, ...]:
         """What `advance` takes beside z: the tensors of ``kept``, then those of ``carried``."""
         code = self._code(observed)
-        last = observed[:, -1]
-        return code, self.action(action), last, self.first_hidden(code), last
+        steps = 0.0 * code[:, :1]
+        return code, self.action(action), self.first_hidden(code), observed[:, -1], steps
 
     def advance(
-        self, z: Float[Tensor, "B D"], state: tuple[Tensor, ...], num_frames: int
+        self,
+        z: Float[Tensor, "B D"],
+        state: tuple[Tensor, ...],
+        num_frames: int,
+        told: Told | None = None,
     ) -> tuple[Float[Tensor, "B L F"], tuple[Tensor, ...]]:
         """The next frames, and the tensors of ``carried`` after them."""
-        code, action, last, hidden, latest = state
+        code, action, hidden, latest, steps = state
         fixed = self.from_request(torch.cat([code, action, z], dim=1))
         patches = []
-        for _ in range(0, num_frames, self.frames_per_step):
-            hidden = self._cell(fixed + self.from_frame(latest), hidden)
-            patch = self.output(hidden).unflatten(1, (self.frames_per_step, -1)) + last[:, None]
+        for start in range(0, num_frames, self.frames_per_step):
+            angle = steps * self.clock_rate
+            clock = self.from_clock(torch.cat([angle.sin(), angle.cos()], dim=1))
+            hidden = self._cell(fixed + clock + self.from_frame(latest), hidden)
+            steps = steps + 1.0
+            patch = self.output(hidden).unflatten(1, (self.frames_per_step, -1)) + latest[:, None]
             latest = patch[:, -1]
+            if told is not None:
+                last = start + self.frames_per_step - 1
+                latest = torch.where(told.here[:, last, None], told.future[:, last], latest)
             patches.append(patch)
-        return torch.cat(patches, dim=1), (hidden, latest)
+        return torch.cat(patches, dim=1), (hidden, latest, steps)
 
     def _cell(
         self, given: Float[Tensor, "B G"], hidden: Float[Tensor, "B H"]

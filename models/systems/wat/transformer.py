@@ -178,9 +178,14 @@ class TransformerVAE(nn.Module):
         return observed, self.action(action)
 
     def advance(
-        self, z: Float[Tensor, "B D"], state: tuple[Tensor, ...], num_frames: int
+        self,
+        z: Float[Tensor, "B D"],
+        state: tuple[Tensor, ...],
+        num_frames: int,
+        told: object = None,
     ) -> tuple[Float[Tensor, "B L F"], tuple[Tensor, ...]]:
-        """The first ``num_frames`` frames, all in one go."""
+        """The first ``num_frames`` frames, all in one go; it cannot be told any of them."""
+        del told
         observed, action = state
         last = observed[:, -1:]
         padded = torch.cat([observed, last.expand(-1, num_frames, -1)], dim=1)
