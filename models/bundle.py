@@ -86,8 +86,9 @@ class ActionsSpec(_Record):
 
     Its decoder gives ``chunk_frames`` frames at a time; what it returns as ``next_<name>`` is its
     input ``<name>`` for the chunk after. An action ends at the first frame, not before
-    ``min_frames``, from which ``stop_window`` frames stay within ``stop_threshold_m`` of their
-    mean (Mao et al. 2022, Eq. 8, over all joints in metres), or after ``horizon`` frames.
+    ``min_frames`` (or what ``shortest`` says of its label), from which ``stop_window`` frames stay
+    within ``stop_threshold_m`` of their mean (Mao et al. 2022, Eq. 8, over all joints in metres),
+    or after ``horizon`` frames.
     """
 
     labels: tuple[str, ...] = Field(min_length=1)
@@ -95,6 +96,8 @@ class ActionsSpec(_Record):
     """For some labels, what a person does who performs it."""
     chunk_frames: int = Field(gt=0)
     min_frames: int = Field(default=1, gt=0)
+    shortest: dict[str, int] = Field(default_factory=dict)
+    """Labels whose least number of frames is not ``min_frames``."""
     stop_window: int = Field(default=5, gt=1)
     stop_threshold_m: float = Field(gt=0)
 

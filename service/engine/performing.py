@@ -90,11 +90,13 @@ class Performer:
         frames = np.concatenate([row.frames, chunk])
         before = self._manifest.num_observed + row.start
         longest = request.max_frames or self._manifest.horizon
+        action = request.actions[len(row.segments)]
+        shortest = spec.shortest.get(spec.labels[action], spec.min_frames)
         made = frames[before : before + longest]
         rest = rest_frame(
             made,
             # Windows that ended before this chunk were judged with the chunk before.
-            start=max(spec.min_frames, len(row.frames) - before - spec.stop_window + 2) - 1,
+            start=max(shortest, len(row.frames) - before - spec.stop_window + 2) - 1,
             window=spec.stop_window,
             threshold_m=request.stop_threshold_m or spec.stop_threshold_m,
         )
@@ -102,7 +104,7 @@ class Performer:
             context = Context(tensors=row.context.tensors | state, encoded=True)
             return replace(row, frames=frames, context=context)
         segment = Segment(
-            action=request.actions[len(row.segments)],
+            action=action,
             start=row.start,
             end=row.start + (len(made) if rest is None else rest + 1),
             stopped=rest is not None,

@@ -143,6 +143,16 @@ def test_action_lasts_to_the_horizon_where_the_body_never_rests(actions_bundle: 
     assert {segments[0].end for segments in result.segments} == {HORIZON}
 
 
+def test_label_may_have_a_shortest_length_of_its_own(actions_bundle: Path):
+    manifest = read_manifest(actions_bundle)
+    assert manifest.actions is not None
+    actions = manifest.actions.model_copy(update={"shortest": {LABELS[1]: 21}})
+    runner = Runner(manifest.model_copy(update={"actions": actions}), actions_bundle)
+    result = predict(Engine(runner), request(0, 1, 0, stop_threshold_m=99.0))
+    for segments in result.segments:
+        assert [segment.end - segment.start for segment in segments] == [MIN_FRAMES, 21, MIN_FRAMES]
+
+
 def test_lenient_threshold_ends_an_action_at_its_shortest(actions_bundle: Path):
     result = predict(engine_of(actions_bundle), request(0, stop_threshold_m=99.0))
     assert {segments[0].end for segments in result.segments} == {MIN_FRAMES}
