@@ -160,7 +160,9 @@ def reconstruction(wat: objective.WAT, data: dict[str, torch.Tensor]) -> torch.T
         for part in ("from_request", "output"):
             for parameter in getattr(wat.form, part).parameters():
                 parameter.zero_()
-    terms = objective._terms(wat, data, torch.Generator().manual_seed(0), 10)
+    terms = objective._terms(
+        wat, data, torch.Generator().manual_seed(0), padding=10, told=(0.0, 0.0)
+    )
     return terms[0].detach()
 
 

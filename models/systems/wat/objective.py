@@ -102,15 +102,23 @@ def loss(  # noqa: PLR0913 - the weights of the terms
     step_weight: float,
     kl_weight: float,
     padding: int,
+    told: tuple[float, float],
 ) -> Losses:
     """Eq. 6: reconstruction where the future is known, a smooth junction, KL to the prior.
 
     Errors are weighted sums of squares over a pose's features, about its squared distance in
-    metres. ``step_weight`` counts the error of each frame's change.
+    metres. ``step_weight`` counts the error of each frame's change. A row's decoder is ``told`` a
+    share of the true frames that is drawn between these two.
     """
     groups = batch["length"].argsort().chunk(LENGTH_GROUPS)
     terms = [
-        _terms(network, {name: value[rows] for name, value in batch.items()}, generator, padding)
+        _terms(
+            network,
+            {name: value[rows] for name, value in batch.items()},
+            generator,
+            padding=padding,
+            told=told,
+        )
         for rows in groups
     ]
     reconstruction, step, smooth, kl = (torch.cat(term).mean() for term in zip(*terms, strict=True))
@@ -127,7 +135,12 @@ def loss(  # noqa: PLR0913 - the weights of the terms
 
 
 def _terms(
-    network: WAT, batch: Batch, generator: Generator, padding: int
+    network: WAT,
+    batch: Batch,
+    generator: Generator,
+    *,
+    padding: int,
+    told: tuple[float, float],
 ) -> tuple[Float[Tensor, "B"], ...]:
     """Each row's reconstruction error, error of steps, roughness of the junction, and KL."""
     action, first, length = batch["action"], batch["first"], batch["length"]
@@ -144,8 +157,8 @@ def _terms(
     expected = network.prior(observed, action)
     noise = torch.randn(mean.shape, generator=generator, device=mean.device)
     z = mean + (0.5 * log_variance).exp() * noise
-    # Each row is told a share of the frames of its own, some none at all, as at run time.
-    share = (1.5 * _uniform(len(z), generator, z) - 0.5)[:, None]
+    least, most = told
+    share = least + (most - least) * _uniform(len(z), generator, z)[:, None]
     here = known & (_uniform(known.shape, generator, z) < share)
     begun = network.form.begin(observed, action)
     predicted, _ = network.form.advance(z, begun, num_frames, Told(future, here))

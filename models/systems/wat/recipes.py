@@ -423,6 +423,7 @@ def _stage(  # noqa: PLR0913 - the terms of the loss
     smooth_weight: float = 300.0,
     step_weight: float = 3_000.0,
     kl_weight: float = 0.1,
+    told: tuple[float, float] = (0.1, 0.9),
 ) -> Stage:
     return Stage(
         name="vae",
@@ -434,6 +435,7 @@ def _stage(  # noqa: PLR0913 - the terms of the loss
             step_weight=step_weight,
             kl_weight=kl_weight,
             padding=_actions(data).padding,
+            told=told,
         ),
         trains=("form",),
         num_updates=num_updates,
@@ -468,6 +470,7 @@ def _paper_stage(
         smooth_weight=smooth_weight,
         step_weight=0.0,
         kl_weight=1.0,
+        told=(0.0, 0.0),
     )
     return dataclasses.replace(
         stage,
