@@ -87,6 +87,9 @@ def main(
     threads: int = 2,
 ) -> None:
     """Print one Markdown table."""
+    if not bundle.exists():
+        print(f"{bundle}: found no bundle; train and export one, or name another.")
+        return
     torch.set_num_threads(threads)
     found = medians(
         {

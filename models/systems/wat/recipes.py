@@ -217,7 +217,7 @@ def humanact12_transformer() -> Recipe:
     return _paper_transformer("humanact12_transformer", HUMANACT12, padding=50)
 
 
-_MOCAP_SMOOTHING = Augmentation(
+_MOCAP_AUGMENTATION = Augmentation(
     yaw=False,  # the canonical frame undoes it
     slowest=0.9,
     fastest=1.1,
@@ -236,7 +236,7 @@ def _mocap_data(
         num_observed=15,
         horizon=300,
         hold_out=hold_out,
-        augmentation=_MOCAP_SMOOTHING,
+        augmentation=_MOCAP_AUGMENTATION,
         actions=Actions(
             labels=MOCAP_LABELS,
             examples=MOCAP_EXAMPLES,
