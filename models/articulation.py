@@ -68,24 +68,22 @@ class Articulation(nn.Module):
 
     def rotations(self, poses: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L K 3 3"]:
         """Rotation of every turning joint relative to its parent, the root's to the world."""
-        frames: list[Tensor] = []
-        local = []
-        for joint in self.turning:
-            above = self._above(joint, frames, poses)
-            frames.append(self._frame(joint, above, poses))
-            local.append(torch.matmul(above.transpose(-1, -2), frames[-1]))
+        frames = self._frames(poses)
+        local = [
+            torch.matmul(self._above(joint, frames, poses).transpose(-1, -2), frame)
+            for joint, frame in zip(self.turning, frames, strict=True)
+        ]
         return torch.stack(local, dim=2)
 
     def bones(self, poses: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B J 3"]:
         """Each person's bone vectors in the frame of the parent joint, means over the frames."""
-        frames: list[Tensor] = []
-        bones = [0.0 * poses[:, 0, 0]] * len(self.parents)  # zeros_like would fix the batch's size
-        for joint in self.turning:
-            frames.append(self._frame(joint, self._above(joint, frames, poses), poses))
+        # zeros_like would fix the batch's size
+        bones = [0.0 * poses[:, 0, 0]] * len(self.parents)
+        for joint, frame in zip(self.turning, self._frames(poses), strict=True):
             for child in self._children[joint]:
                 bone = poses[:, :, child] - poses[:, :, joint]
                 if joint in self._axes:
-                    bones[child] = torch.matmul(bone[:, :, None], frames[-1])[:, :, 0].mean(dim=1)
+                    bones[child] = torch.matmul(bone[:, :, None], frame)[:, :, 0].mean(dim=1)
                 else:
                     length = bone.square().sum(dim=-1, keepdim=True).sqrt().mean(dim=1)
                     bones[child] = length * self.rest_direction[child]
@@ -105,6 +103,13 @@ class Articulation(nn.Module):
         parents = [self._place[max(parent, 0)] for parent in self.parents]
         turned = torch.matmul(torch.stack(frames, dim=2)[:, :, parents], bones[:, None, :, :, None])
         return root[:, :, None] + torch.matmul(self.path, turned[..., 0])
+
+    def _frames(self, poses: Float[Tensor, "B L J 3"]) -> list[Tensor]:
+        """Every turning joint's axes in the world, (B, L, 3, 3)."""
+        frames: list[Tensor] = []
+        for joint in self.turning:
+            frames.append(self._frame(joint, self._above(joint, frames, poses), poses))
+        return frames
 
     def _above(self, joint: int, frames: list[Tensor], like: Tensor) -> Tensor:
         if joint == 0:

@@ -21,6 +21,7 @@ from torch.nn.utils.rnn import pack_padded_sequence
 from models.motion.skeleton import Skeleton
 from models.pose import WorldPoses
 from models.system import Batch, Data, Graph, Losses, Recipe, Stage
+from training.data.batches import described_data
 from training.data.store import Store
 from training.loop import RECIPE_FILE, RunError, finished_weights
 
@@ -188,12 +189,5 @@ def read_judge(folder: Path, store: Store) -> Judge:
     labels = {label: tuple(selectors) for label, selectors in said["actions"]["labels"].items()}
     network = ActionClassifier(skeleton=store.skeleton, fps=store.fps, num_labels=len(labels))
     network.load_state_dict(weights)
-    data = Data(
-        skeleton=store.skeleton,
-        fps=store.fps,
-        num_observed=said["num_observed"],
-        horizon=said["horizon"],
-        shares=said["shares"],
-        hold_out=tuple(said["hold_out"]),
-    )
+    data = described_data(said, store, num_observed=said["num_observed"], horizon=said["horizon"])
     return Judge(network=network.eval(), labels=labels, data=data)

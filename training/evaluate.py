@@ -14,7 +14,7 @@ from models.system import Data
 from service.engine.engine import Engine
 from service.engine.runner import Runner
 from service.futures import BoneLengths
-from training.data.batches import training_clips
+from training.data.batches import described_data, training_clips
 from training.data.store import ClipRecord, Store, select
 from training.data.windows import Windows, cut
 from training.predictors import (
@@ -183,14 +183,7 @@ def learnt_from(manifest: Manifest, store: Store) -> Data | None:
     said: dict[str, Any] | None = manifest.recipe.get("data")
     if said is None or not manifest.recipe.get("stages"):
         return None
-    return Data(
-        skeleton=store.skeleton,
-        fps=store.fps,
-        num_observed=manifest.num_observed,
-        horizon=manifest.horizon,
-        shares=said.get("shares"),
-        hold_out=tuple(said.get("hold_out", ())),
-    )
+    return described_data(said, store, num_observed=manifest.num_observed, horizon=manifest.horizon)
 
 
 def _bank(

@@ -46,27 +46,18 @@ def _check_actions(request: Request, manifest: Manifest) -> None:
 
 
 def _check_stop(request: Request, manifest: Manifest) -> None:
-    longest_s, seconds, threshold_m = (
-        manifest.horizon / manifest.fps,
-        None,
-        request.stop_threshold_m,
-    )
-    if request.max_frames is not None:
-        seconds = request.max_frames / manifest.fps
-    performs = "performs no actions"
-    if seconds is not None and not (manifest.actions and 0 < seconds <= longest_s):
-        if manifest.actions:
-            performs = f"performs an action for at most {longest_s:g} s"
+    frames, threshold_m = request.max_frames, request.stop_threshold_m
+    if frames is not None and not (manifest.actions and 1 <= frames <= manifest.horizon):
+        longest = f"performs an action for at most {manifest.horizon / manifest.fps:g} s"
         raise FieldError(
             pointer="/max_seconds_per_action",
-            found=f"{seconds:g} s",
-            expected=f"{manifest.name} {performs}",
+            found=f"{frames / manifest.fps:g} s",
+            expected=f"{manifest.name} {longest if manifest.actions else 'performs no actions'}",
         )
     if threshold_m is not None and not (manifest.actions and threshold_m > 0):
-        if manifest.actions:
-            performs = "takes a threshold above 0"
+        least = "takes a threshold above 0"
         raise FieldError(
             pointer="/stop_threshold",
             found=f"{threshold_m:g} m",
-            expected=f"{manifest.name} {performs}",
+            expected=f"{manifest.name} {least if manifest.actions else 'performs no actions'}",
         )

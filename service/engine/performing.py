@@ -73,12 +73,16 @@ class Performer:
         self._runner.encode(contexts)
         drawn = np.stack([row.noise for row in rows])
         outputs = self._runner.run("decoder", {"noise": drawn}, contexts)
-        state = {name: rows for name, rows in outputs.items() if name.startswith(NEXT)}
+        state = {
+            name.removeprefix(NEXT): values
+            for name, values in outputs.items()
+            if name.startswith(NEXT)
+        }
         return [
             self._continued(
                 row,
                 outputs["future"][i],
-                {name.removeprefix(NEXT): values[i : i + 1] for name, values in state.items()},
+                {name: values[i : i + 1] for name, values in state.items()},
             )
             for i, row in enumerate(rows)
         ]

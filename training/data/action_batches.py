@@ -9,7 +9,7 @@ from torch import Tensor
 
 from models.motion.skeleton import Skeleton
 from models.system import Actions, Data
-from training.data.augment import draw_mirrored
+from training.data.augment import draw_mirrored, draw_rates
 from training.data.batch_source import BatchSource
 from training.data.batches import require_fit, training_clips, varied_rows
 from training.data.store import ClipRecord, Store, StoreError, select
@@ -144,8 +144,7 @@ class ActionBatches(BatchSource):
         }
 
     def _rates(self, clips: Rows, generator: np.random.Generator) -> Float[np.ndarray, "B"]:
-        slowest = self._data.augmentation.slowest
-        return slowest * (self._fastest[clips] / slowest) ** generator.random(len(clips))
+        return draw_rates(self._fastest[clips], how=self._data.augmentation, generator=generator)
 
     def _begins(
         self, clips: Rows, rates: Float[np.ndarray, "B"], generator: np.random.Generator

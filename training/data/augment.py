@@ -18,6 +18,16 @@ def warped_frames(
     return whole, (position - whole).astype(np.float32)[..., None, None]
 
 
+def draw_rates(
+    fastest: Float[np.ndarray, "B"], *, how: Augmentation, generator: np.random.Generator
+) -> Float[np.ndarray, "B"]:
+    """Playing rates from ``how.slowest`` to each row's fastest.
+
+    Uniform on a logarithmic scale, so that slower and faster are equally likely.
+    """
+    return np.asarray(how.slowest * (fastest / how.slowest) ** generator.random(len(fastest)))
+
+
 def mirror(poses: Poses, skeleton: Skeleton) -> Poses:
     """Poses reflected in the X-Z plane, left and right joints exchanged."""
     reflected = poses * np.array([1, -1, 1], poses.dtype)

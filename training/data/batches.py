@@ -1,12 +1,21 @@
 """Batches of windows, and how any window becomes a row of a batch."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from models.system import Data
-from training.data.augment import add_sensor_noise, augment, draw_mirrored, warped_frames
+from training.data.augment import (
+    add_sensor_noise,
+    augment,
+    draw_mirrored,
+    draw_rates,
+    warped_frames,
+)
 from training.data.batch_source import BatchSource
 from training.data.store import ClipRecord, Store, StoreError, select
 from training.data.windows import Windows
@@ -18,6 +27,20 @@ def training_clips(store: Store, data: Data) -> tuple[ClipRecord, ...]:
     held_out = set(select(store.clips, data.hold_out))
     sources = tuple(data.shares) if data.shares else ("",)
     return tuple(c for c in wanted if c not in held_out and c.source.startswith(sources))
+
+
+def described_data(
+    said: Mapping[str, Any], store: Store, *, num_observed: int, horizon: int
+) -> Data:
+    """What `training_clips` needs of the data of a recipe that was described as JSON."""
+    return Data(
+        skeleton=store.skeleton,
+        fps=store.fps,
+        num_observed=num_observed,
+        horizon=horizon,
+        shares=said.get("shares"),
+        hold_out=tuple(said.get("hold_out", ())),
+    )
 
 
 def require_fit(store: Store, data: Data) -> None:
@@ -86,8 +109,7 @@ class Batches(BatchSource):
         drawn = self.windows.draw(size, generator)
         room = self.windows.room[drawn]
         fastest = np.minimum(how.fastest, (room - 1) / (self._length - 1))
-        # Uniform on a logarithmic scale, so that slower and faster are equally likely.
-        rates = how.slowest * (fastest / how.slowest) ** generator.random(size)
+        rates = draw_rates(fastest, how=how, generator=generator)
         whole, fraction = warped_frames(self._length, rates)
         first = self.windows.starts[drawn][:, None] + whole
         last = self.windows.starts[drawn][:, None] + np.minimum(whole + 1, room[:, None] - 1)

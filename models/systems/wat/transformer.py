@@ -149,10 +149,8 @@ class TransformerVAE(nn.Module):
         self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
     ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
         """Mean and log variance of z before the future is known."""
-        pair = self.prior_summary(action).unflatten(1, (2, -1))
-        tokens = torch.cat([pair, self.prior_stack.tokens(self._patches(observed))], dim=1)
-        result = self.prior_stack(tokens, self.may_see[None, -1:, : tokens.shape[1]])
-        return result[:, 0], result[:, 1]
+        everything = self.may_see[None, -1:, : 2 + self.num_observed]
+        return self._summarised(self.prior_stack, self.prior_summary(action), observed, everything)
 
     def posterior(
         self,
@@ -164,12 +162,11 @@ class TransformerVAE(nn.Module):
         """Mean and log variance of z after the first ``num_frames`` frames of the future."""
         last = (num_frames - 1).div(self.frames_per_step, rounding_mode="floor")
         frames = torch.cat([observed, future], dim=1)
-        pair = self.posterior_summary(action).unflatten(1, (2, -1))
-        tokens = torch.cat([pair, self.posterior_stack.tokens(self._patches(frames))], dim=1)
-        index = torch.arange(tokens.shape[1], device=tokens.device)
+        index = torch.arange(2 + frames.shape[1] // self.frames_per_step, device=action.device)
         known = index[None] < (2 + self.num_observed + 1 + last)[:, None]
-        result = self.posterior_stack(tokens, known[:, None])
-        return result[:, 0], result[:, 1]
+        return self._summarised(
+            self.posterior_stack, self.posterior_summary(action), frames, known[:, None]
+        )
 
     def begin(
         self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
@@ -194,6 +191,19 @@ class TransformerVAE(nn.Module):
         seen = self.decoder_stack(tokens, may_see, torch.stack([z, action], dim=1))
         patches = self.output(seen[:, self.num_observed :])
         return patches.unflatten(2, (self.frames_per_step, -1)).flatten(1, 2) + last, ()
+
+    def _summarised(
+        self,
+        stack: Stack,
+        summary: Float[Tensor, "B S2"],
+        frames: Float[Tensor, "B L F"],
+        may_see: Bool[Tensor, "#B 1 K"],
+    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
+        """What the two summary tokens say after seeing the frames."""
+        pair = summary.unflatten(1, (2, -1))
+        tokens = torch.cat([pair, stack.tokens(self._patches(frames))], dim=1)
+        result = stack(tokens, may_see)
+        return result[:, 0], result[:, 1]
 
     def _patches(self, frames: Float[Tensor, "B L F"]) -> Float[Tensor, "B S P"]:
         return frames.unflatten(1, (-1, self.frames_per_step)).flatten(2)
