@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from models.layers import in_lanes
 from models.motion.skeleton import Skeleton
 from models.pose import Frame, facing
 
@@ -264,11 +265,13 @@ class ArticulatedPoses(nn.Module):
         changes = features[:, :, -4:] * self.units
         headings = start[:, None, 0] + changes[:, :, 0].cumsum(dim=1)
         before = torch.cat([start[:, :1], headings[:, :-1]], dim=1)
-        cos, sin, (forward, left) = before.cos(), before.sin(), changes[:, :, 1:3].unbind(dim=2)
+        cos, sin = in_lanes(torch.cos, before), in_lanes(torch.sin, before)
+        forward, left = changes[:, :, 1:3].unbind(dim=2)
         steps = torch.stack([cos * forward - sin * left, sin * forward + cos * left], dim=2)
         ground = start[:, None, 1:] + steps.cumsum(dim=1)
         rotations = from_6d(features[:, :, :-4].reshape(*features.shape[:2], -1, 6))
-        upright = torch.matmul(_about_z(headings.cos(), headings.sin()), rotations[:, :, 0])
+        cos, sin = in_lanes(torch.cos, headings), in_lanes(torch.sin, headings)
+        upright = torch.matmul(_about_z(cos, sin), rotations[:, :, 0])
         rotations = torch.cat([upright[:, :, None], rotations[:, :, 1:]], dim=2)
         root = torch.cat([ground, changes[:, :, 3:]], dim=2)
         poses = Frame(observation, self._pairs).leave(
@@ -292,7 +295,7 @@ class ArticulatedPoses(nn.Module):
         turned = (sin[:, 1:] * c - cos[:, 1:] * s) / (cos[:, 1:] * c + sin[:, 1:] * s).clamp(
             min=0.1
         )
-        parts = [turned.atan(), c * dx + s * dy, c * dy - s * dx, root[:, 1:, 2]]
+        parts = [in_lanes(torch.atan, turned), c * dx + s * dy, c * dy - s * dx, root[:, 1:, 2]]
         return to_6d(rotations).flatten(2), torch.stack(parts, dim=2) / self.units
 
 

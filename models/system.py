@@ -57,8 +57,6 @@ class Actions:
     longest_transition: int = 25
     chunk_frames: int = 20
     min_frames: int = 15
-    shortest: Mapping[str, int] = field(default_factory=dict)
-    """Frames after the observation that the stop rule lets pass, by label; else ``min_frames``."""
     stop_threshold_m: float = 0.02
 
 

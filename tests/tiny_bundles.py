@@ -40,6 +40,7 @@ PACE = TensorSpec(name="pace", shape=("B", *NOISE_SHAPE))
 GOAL = TensorSpec(name="goal", shape=("B", NUM_JOINTS, 3))
 POSE = TensorSpec(name="pose", shape=("B", NUM_JOINTS, 3))
 NEXT_POSE = TensorSpec(name="next_pose", shape=("B", NUM_JOINTS, 3))
+EARLIEST_END = TensorSpec(name="earliest_end", shape=("B", 1))
 CHUNK = TensorSpec(name="future", shape=("B", CHUNK_FRAMES, NUM_JOINTS, 3))
 
 
@@ -118,17 +119,19 @@ class ActionDecoder(torch.nn.Module):
     Every frame is nearer to the goal by a factor that the pace decides.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, earliest_end: float | None = None) -> None:
         super().__init__()
+        self.earliest_end = earliest_end
         self.register_buffer("times", torch.arange(1.0, CHUNK_FRAMES + 1))
 
     def forward(
         self, pace: torch.Tensor, goal: torch.Tensor, pose: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> tuple[torch.Tensor, ...]:
         left = 0.88 + 0.06 * torch.tanh(pace[:, :1])
         left = (left**self.times)[:, :, None, None]
         future = goal[:, None] + left * (pose - goal)[:, None]
-        return future, future[:, -1]
+        said = () if self.earliest_end is None else (0.0 * left[:, 0, 0] + self.earliest_end,)
+        return future, future[:, -1], *said
 
 
 class LastPose(torch.nn.Module):
@@ -222,8 +225,13 @@ def write_diffusion_bundle(folder: Path, *, eta: float = 0.0, directions: int = 
     return write(folder, graphs, schedule=spec, x_t_shape=X_T_SHAPE)
 
 
-def write_actions_bundle(folder: Path, *, draws: str | None = "decoder") -> Path:
-    """A bundle that performs `LABELS`; its decoder, its encoder or no graph asks for noise."""
+def write_actions_bundle(
+    folder: Path, *, draws: str | None = "decoder", earliest_end: float | None = None
+) -> Path:
+    """A bundle that performs `LABELS`; its decoder, its encoder or no graph asks for noise.
+
+    The decoder may say the ``earliest_end`` of every action.
+    """
     if draws == "decoder":
         encoder, pace, inputs, outputs = ActionEncoder, NOISE, (), ()
     else:
@@ -237,7 +245,10 @@ def write_actions_bundle(folder: Path, *, draws: str | None = "decoder") -> Path
             outputs=(GOAL, POSE, *outputs),
         ),
         "decoder": exported(
-            ActionDecoder(), "decoder.onnx", inputs=(pace, GOAL, POSE), outputs=(CHUNK, NEXT_POSE)
+            ActionDecoder(earliest_end=earliest_end),
+            "decoder.onnx",
+            inputs=(pace, GOAL, POSE),
+            outputs=(CHUNK, NEXT_POSE, *(() if earliest_end is None else (EARLIEST_END,))),
         ),
     }
     actions = ActionsSpec(

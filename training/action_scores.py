@@ -42,6 +42,7 @@ LABEL_COLUMNS: tuple[tuple[str, str], ...] = (
     ("Div_w", "{div_w:.3f}"),
     ("real Div_w", "{real_div_w:.3f}"),
     ("frames", "{frames:.0f}"),
+    ("begun already", "{begun_frames:.0f}"),
     ("real frames", "{real_frames:.0f}"),
     ("off by %", "{length_off:.0f}"),
     ("cut off %", "{cut_off:.1f}"),
@@ -64,10 +65,11 @@ to those of real clips, all actions alike. Div, Div_w, ADE and ADE_w in metres, 
 vector, relative to the root without it; Div holds the last pose to the longest future, _w is after
 dynamic time warping; real Div_w is among clips of one action, predicted among futures of one
 history. ADE where the action is the history's own, best of the samples. Cut off: not stopped by
-itself at the longest. Length: the mean of an action beside that of the held-out clips, mean and
-worst action. Velocity change at the first predicted frame: times the real one, mean of all frames.
-Stretch over all bones, no bone lengths fitted. Trained on: share of the held-out clips that the
-bundle's training data hold. Means over actions, all alike."""
+itself at the longest. Length: the mean of an action that the history has begun already beside that
+of the held-out clips, mean and worst action; frames are those after any history, most of which
+have to get into the action first. Velocity change at the first predicted frame: times the real one,
+mean of all frames. Stretch over all bones, no bone lengths fitted. Trained on: share of the
+held-out clips that the bundle's training data hold. Means over actions, all alike."""
 
 MOST_COMPARED = 16
 """Futures of which all pairs are compared; of more, so many are taken, evenly spread."""
@@ -151,6 +153,7 @@ class ActionScorer:
             item["div"] = diversity(compared, longest=self._longest)
             item["div_w"] = warped_diversity(compared)
         if real is not None:
+            item["begun_frames"] = item["frames"]
             truth = pose_vectors(histories[0, -1], real, self._skeleton)
             item["ade"] = displacement(vectors, truth)
             item["ade_w"] = warped_displacement(vectors, truth)
@@ -220,7 +223,8 @@ class RealActions:
             if real > 0:
                 means[f"{key}_ratio"] = _mean([values[key] for values in both]) / real
         if shared:
-            means["length_off_worst"] = max(values["length_off"] for values in shared)
+            offs = [values["length_off"] for values in shared if "length_off" in values]
+            means["length_off_worst"] = max(offs, default=math.nan)
         mine = scorer.recognised()
         for name, real_features in self.features.items():
             comparable = mine.of_labels(real_features.labels).balanced()
@@ -293,8 +297,11 @@ def inner_changes(motion: Float[np.ndarray, "L J 3"]) -> Float[np.ndarray, "M"]:
 
 def _beside(values: Means, real: Means) -> Means:
     kept = ("accuracy", "div_w", "frames")
-    off = 100 * abs(values["frames"] - real["frames"]) / real["frames"]
-    return {f"real_{key}": real[key] for key in kept if key in real} | {"length_off": off}
+    beside = {f"real_{key}": real[key] for key in kept if key in real}
+    if "begun_frames" in values:
+        off = abs(values["begun_frames"] - real["frames"]) / real["frames"]
+        beside["length_off"] = 100 * off
+    return beside
 
 
 def _means(items: Sequence[Means]) -> Means:

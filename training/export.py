@@ -205,7 +205,6 @@ def _manifest(recipe: Recipe, label: Label, specs: Mapping[str, GraphSpec]) -> M
             examples=dict(data.actions.examples),
             chunk_frames=data.actions.chunk_frames,
             min_frames=data.actions.min_frames,
-            shortest=dict(data.actions.shortest),
             stop_threshold_m=data.actions.stop_threshold_m,
         )
     return Manifest(**fields, **dict[str, Any](specs))
@@ -233,7 +232,7 @@ def unstopped(manifest: Manifest) -> Manifest:
     """The same bundle, its actions as long as they may be: no error in rounding ends one early."""
     if manifest.actions is None:
         return manifest
-    actions = manifest.actions.model_copy(update={"min_frames": manifest.horizon, "shortest": {}})
+    actions = manifest.actions.model_copy(update={"min_frames": manifest.horizon})
     return manifest.model_copy(update={"actions": actions})
 
 

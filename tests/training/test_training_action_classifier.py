@@ -13,6 +13,7 @@ from tiny_bundles import standing_pose
 from models.motion.kinematics import rotate_yaw
 from models.motion.skeleton import BODY21
 from models.system import Actions, Data, Recipe
+from training import action_classifier
 from training.action_classifier import (
     ActionClassifier,
     Judge,
@@ -105,6 +106,17 @@ def test_frames_after_the_end_are_not_seen():
     assert not torch.allclose(ask.features(poses, length)[0], ask.features(changed, length)[0])
 
 
+def test_transition_leads_straight_to_the_first_pose_that_is_known():
+    batch = made_up()
+    batch["first"][0] = 4
+    batch["future"][0, :4] = batch["future"][0, 4]  # as batches of actions repeat it
+    joined = action_classifier._with_transition(batch)
+    steps = torch.cat([batch["observation"][0, -1:], joined[0, :5]]).diff(dim=0)
+    torch.testing.assert_close(steps, steps[:1].expand_as(steps), atol=1e-5, rtol=0)
+    assert torch.equal(joined[0, 4:], batch["future"][0, 4:])
+    assert torch.equal(joined[1:], batch["future"][1:])
+
+
 def test_some_updates_tell_actions_apart():
     chosen, batch = network(), made_up()
     optimiser = torch.optim.Adam(chosen.parameters(), lr=2e-3)
@@ -129,7 +141,7 @@ def test_classifier_learns_from_the_clips_of_its_recipe_and_is_read_again(
 ):
     chosen = classifier_recipe(recipe, num_updates=3)
     assert chosen.data.hold_out == recipe.data.hold_out
-    assert chosen.data.actions == dataclasses.replace(recipe.data.actions, other_share=0.0)
+    assert chosen.data.actions == recipe.data.actions
     assert chosen.graphs(chosen.build()) == ()
     trained = train(chosen, store, tmp_path, device=CPU)
     ask = read_judge(tmp_path, store)

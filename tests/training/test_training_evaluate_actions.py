@@ -124,8 +124,8 @@ def test_velocity_change_is_the_second_difference_at_the_first_frame():
 
 def test_real_actions_are_as_good_as_themselves():
     scores = scorer()
-    scores.add(performance(0, 20, 30))
-    scores.add(performance(1, 40, 50, 60, seed=4))
+    for real in (performance(0, 20, 30), performance(1, 40, 50, 60, seed=4)):
+        scores.add(real, real=real.futures[0])
     features = {"train": scores.recognised(), "held_out": scores.recognised()}
     real = RealActions(by_label=scores.by_label(), features=features, velocity_change=1.0)
     means, labels = real.compare(scores)
@@ -137,8 +137,8 @@ def test_real_actions_are_as_good_as_themselves():
 
 def test_predicted_actions_are_compared_label_by_label():
     scores, reality = scorer(), scorer()
-    scores.add(performance(0, 20, 20))
-    scores.add(performance(1, 20, 40))
+    for begun in (performance(0, 20, 20), performance(1, 20, 40)):
+        scores.add(begun, real=begun.futures[0])
     reality.add(performance(0, 10, 10, seed=7))
     reality.add(performance(1, 60, 60, seed=7))
     features = {"held_out": reality.recognised()}
@@ -152,6 +152,19 @@ def test_predicted_actions_are_compared_label_by_label():
     assert means["velocity_change_ratio"] == pytest.approx(2 * means["velocity_change"])
     wanted = fid(scores.recognised().features, reality.recognised().features)
     assert means["fid_held_out"] == pytest.approx(wanted)
+
+
+def test_length_is_that_of_actions_that_the_history_has_begun():
+    scores, reality = scorer(), scorer()
+    scores.add(performance(0, 90, 90))  # from another action
+    begun = performance(0, 30, 40, seed=2)
+    scores.add(begun, real=begun.futures[0])
+    reality.add(performance(0, 50, 50))
+    features = {"held_out": reality.recognised()}
+    real = RealActions(by_label=reality.by_label(), features=features, velocity_change=0.5)
+    _, labels = real.compare(scores)
+    assert labels[0]["length_off"] == pytest.approx(30.0)
+    assert labels[0]["frames"] == pytest.approx(62.5)
 
 
 def test_action_without_a_real_clip_counts_in_no_comparison():

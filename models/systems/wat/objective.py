@@ -11,6 +11,7 @@ from models.articulation import ArticulatedPoses
 from models.pose import cosine_basis
 from models.system import Batch, Losses
 from models.systems.wat.recurrent import Told
+from models.systems.wat.timing import LENGTH_UNIT, NUM_TIMES, Rhythm
 
 LOG_VARIANCE_LIMIT = 8.0
 POSTERIOR_LOG_VARIANCE = -4.0
@@ -32,11 +33,12 @@ class WAT(nn.Module):
     fading: Tensor
     momentum: Tensor
 
-    def __init__(self, *, poses: ArticulatedPoses, form: nn.Module) -> None:
+    def __init__(self, *, poses: ArticulatedPoses, rhythm: Rhythm, form: nn.Module) -> None:
         super().__init__()
         self.poses = poses
         # Either form's: `recurrent` or `transformer`, whose classes have the same methods.
         self.form: Any = form
+        self.rhythm = rhythm
         basis = cosine_basis(NUM_BASES, 2 * HALF_WINDOW)
         self.register_buffer("smooth", basis @ basis.T, persistent=False)
         frame = torch.arange(FADED_AFTER, dtype=torch.float32)
@@ -48,8 +50,11 @@ class WAT(nn.Module):
 
     def prior(
         self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
-    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
-        """Mean and log variance of z given what is known when a request arrives."""
+    ) -> tuple[Float[Tensor, "B Z"], Float[Tensor, "B Z"]]:
+        """Mean and log variance of z given what is known when a request arrives.
+
+        The last coordinates are a timing, which is drawn like the others.
+        """
         mean, log_variance = self.form.prior(observed, action)
         return mean, log_variance.clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
 
@@ -87,9 +92,11 @@ class WAT(nn.Module):
 
 @torch.no_grad()
 def fit_poses(network: WAT, next_batch: Callable[[], Batch], *, num_batches: int) -> None:
-    """Set rest directions and weights of the features to those of the data."""
+    """Set rest directions, weights of the features, and the feet, to those of the data."""
     batches = [next_batch() for _ in range(num_batches)]
-    network.poses.fit(torch.cat([batch["observation"] for batch in batches]))
+    observations = torch.cat([batch["observation"] for batch in batches])
+    network.poses.fit(observations)
+    network.rhythm.fit(observations)
 
 
 def loss(  # noqa: PLR0913 - the weights of the terms
@@ -121,16 +128,20 @@ def loss(  # noqa: PLR0913 - the weights of the terms
         )
         for rows in groups
     ]
-    reconstruction, step, smooth, kl = (torch.cat(term).mean() for term in zip(*terms, strict=True))
+    reconstruction, step, smooth, kl, timing = (
+        torch.cat(term).mean() for term in zip(*terms, strict=True)
+    )
     return {
         "total": reconstruction_weight * reconstruction
         + step_weight * step
         + smooth_weight * smooth
-        + kl_weight * kl,
+        + kl_weight * kl
+        + timing,
         "reconstruction": reconstruction,
         "step": step,
         "smooth": smooth,
         "kl": kl,
+        "timing": timing,
     }
 
 
@@ -142,7 +153,10 @@ def _terms(
     padding: int,
     told: tuple[float, float],
 ) -> tuple[Float[Tensor, "B"], ...]:
-    """Each row's reconstruction error, error of steps, roughness of the junction, and KL."""
+    """Each row's reconstruction error, error of steps, roughness of the junction, KL, and timing.
+
+    Timing is how unlikely the prior takes the true one to be.
+    """
     action, first, length = batch["action"], batch["first"], batch["length"]
     patch = network.form.frames_per_step
     needed = int((length + padding).max())
@@ -152,16 +166,18 @@ def _terms(
         future = network.poses.enter(batch["observation"], batch["future"][:, :num_frames])
     frame = torch.arange(num_frames, device=first.device)
     # After a transition the first pose is known, but not the step that led to it.
-    known = (frame >= (first + (first > 0))[:, None]) & (frame < (length + padding)[:, None])
+    begun = frame >= (first + (first > 0))[:, None]
+    known = begun & (frame < (length + padding)[:, None])
+    timing, sure = _timing(network, batch, performed=begun & (frame < length[:, None]))
     mean, log_variance = network.posterior(observed, future, length.clamp(max=num_frames), action)
-    expected = network.prior(observed, action)
+    expected, expected_log_variance = network.prior(observed, action)
     noise = torch.randn(mean.shape, generator=generator, device=mean.device)
-    z = mean + (0.5 * log_variance).exp() * noise
+    z = torch.cat([mean + (0.5 * log_variance).exp() * noise, timing], dim=1)
     least, most = told
     share = least + (most - least) * _uniform(len(z), generator, z)[:, None]
     here = known & (_uniform(known.shape, generator, z) < share)
-    begun = network.form.begin(observed, action)
-    predicted, _ = network.form.advance(z, begun, num_frames, Told(future, here))
+    state = network.form.begin(observed, action)
+    predicted, _ = network.form.advance(z, state, num_frames, Told(future, here))
     predicted = network.joined(predicted, observed, torch.ones_like(z[:, :1]))
     weight = network.poses.weights.sqrt()
     error = (predicted - future) * weight
@@ -171,8 +187,31 @@ def _terms(
         _mean_over_known(error, known),
         _mean_over_known(error.diff(dim=1), known[:, 1:] & known[:, :-1]),
         rough.square().sum(dim=2).mean(dim=1),
-        _kl(mean, log_variance, *expected),
+        _kl(mean, log_variance, expected[:, :-NUM_TIMES], expected_log_variance[:, :-NUM_TIMES]),
+        _unlikely(timing, sure, expected[:, -NUM_TIMES:], expected_log_variance[:, -NUM_TIMES:]),
     )
+
+
+def _timing(
+    network: WAT, batch: Batch, *, performed: Bool[Tensor, "B L"]
+) -> tuple[Float[Tensor, "B 4"], Float[Tensor, "B 4"]]:
+    """The timing of the true future, and how sure each of its numbers is, 0 to 1."""
+    with torch.no_grad():
+        poses = batch["future"][:, : performed.shape[1]]
+        rhythm, sure = network.rhythm.measure(poses, performed)
+    log_length = (batch["length"][:, None] / LENGTH_UNIT).log()
+    sure = sure[:, None]
+    return torch.cat([log_length, rhythm], 1), torch.cat([1 + 0 * sure, sure, sure, sure], 1)
+
+
+def _unlikely(
+    timing: Float[Tensor, "B 4"],
+    sure: Float[Tensor, "B 4"],
+    mean: Float[Tensor, "B 4"],
+    log_variance: Float[Tensor, "B 4"],
+) -> Float[Tensor, "B"]:
+    error = nn.functional.gaussian_nll_loss(mean, timing, log_variance.exp(), reduction="none")
+    return (sure * error).sum(dim=1)
 
 
 def _uniform(shape: Any, generator: Generator, like: Tensor) -> Tensor:

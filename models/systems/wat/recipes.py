@@ -12,6 +12,7 @@ from models.systems.wat import objective
 from models.systems.wat.graphs import graphs
 from models.systems.wat.objective import WAT
 from models.systems.wat.recurrent import RecurrentVAE
+from models.systems.wat.timing import NUM_TIMES, Rhythm
 from models.systems.wat.transformer import TransformerVAE
 
 FRAMES_PER_STEP = 5
@@ -34,14 +35,6 @@ HELD_OUT = ("style=feminine",)
 MOCAP_LABELS = {label: (f"action={label}&source=bandai*",) for label in MOCAP_EXAMPLES}
 """The labels with a hundred clips or more; the others have two to thirty and are left out."""
 
-SHORTEST = (
-    {f"raise-up-{hand}": 48 for hand in ("both-hands", "left-hand", "right-hand")}
-    | {"run": 60, "walk": 190, "walk-turn-left": 118, "walk-turn-right": 118}
-    | {f"wave-{hand}": 180 for hand in ("both-hands", "left-hand", "right-hand")}
-)
-"""About what half of the training clips last at least, in frames after the observation: people
-pause in the midst of waving, stiller than at the end of many another action."""
-
 
 def build_recurrent(
     *,
@@ -61,7 +54,7 @@ def build_recurrent(
         widths=widths,
         frames_per_step=frames_per_step,
     )
-    return WAT(poses=poses, form=form)
+    return WAT(poses=poses, rhythm=Rhythm(data.skeleton), form=form)
 
 
 def build_transformer(
@@ -86,7 +79,7 @@ def build_transformer(
         layers=layers,
         frames_per_step=frames_per_step,
     )
-    return WAT(poses=poses, form=form)
+    return WAT(poses=poses, rhythm=Rhythm(data.skeleton), form=form)
 
 
 def mocap() -> Recipe:
@@ -244,7 +237,6 @@ def _mocap_data(
             padding=padding,
             chunk_frames=20,
             min_frames=15,
-            shortest=SHORTEST,
             stop_threshold_m=0.06,
         ),
     )
@@ -343,7 +335,7 @@ def _mocap_recurrent(name: str, data: Data) -> Recipe:
         "widths": (300, 200),
         "frames_per_step": FRAMES_PER_STEP,
     }
-    return _recurrent(name, data, sizes=sizes, stage=_stage(data, num_updates=8_000))
+    return _recurrent(name, data, sizes=sizes, stage=_stage(data, num_updates=5_000), spread=1.1)
 
 
 def _mocap_transformer(name: str, data: Data) -> Recipe:
@@ -354,7 +346,8 @@ def _mocap_transformer(name: str, data: Data) -> Recipe:
         "layers": 4,
         "frames_per_step": FRAMES_PER_STEP,
     }
-    return _transformer(name, data, sizes=sizes, stage=_stage(data, num_updates=5_000, rate=5e-4))
+    stage = _stage(data, num_updates=5_000, rate=5e-4)
+    return _transformer(name, data, sizes=sizes, stage=stage, spread=0.8)
 
 
 def _paper_recurrent(
@@ -385,21 +378,31 @@ def _paper_transformer(
     return _transformer(name, data, sizes=sizes, stage=_paper_stage(data, **terms))
 
 
-def _recurrent(name: str, data: Data, *, sizes: dict[str, Any], stage: Stage) -> Recipe:
+def _recurrent(
+    name: str, data: Data, *, sizes: dict[str, Any], stage: Stage, spread: float = 1.0
+) -> Recipe:
     build = partial(build_recurrent, data=data, **sizes)
-    return _recipe(name, data, build, stage, latent=sizes["latent"])
+    return _recipe(name, data, build, stage, latent=sizes["latent"], spread=spread)
 
 
-def _transformer(name: str, data: Data, *, sizes: dict[str, Any], stage: Stage) -> Recipe:
+def _transformer(
+    name: str, data: Data, *, sizes: dict[str, Any], stage: Stage, spread: float = 1.0
+) -> Recipe:
     # Its decoder needs no recursion: one chunk is the whole of an action.
     actions = dataclasses.replace(_actions(data), chunk_frames=data.horizon)
     data = dataclasses.replace(data, actions=actions)
     build = partial(build_transformer, data=data, **sizes)
-    return _recipe(name, data, build, stage, latent=sizes["width"])
+    return _recipe(name, data, build, stage, latent=sizes["width"], spread=spread)
 
 
 def _recipe(
-    name: str, data: Data, build: Callable[[], WAT], stage: Stage, *, latent: int
+    name: str,
+    data: Data,
+    build: Callable[[], WAT],
+    stage: Stage,
+    *,
+    latent: int,
+    spread: float,
 ) -> Recipe:
     return Recipe(
         name=name,
@@ -407,9 +410,11 @@ def _recipe(
         description="Performs labelled actions one after the other, each as long as it takes.",
         data=data,
         build=build,
-        graphs=partial(graphs, chunk_frames=_actions(data).chunk_frames),
+        graphs=partial(
+            graphs, chunk_frames=_actions(data).chunk_frames, horizon=data.horizon, spread=spread
+        ),
         stages=(stage,),
-        x_t_shape=(latent,),
+        x_t_shape=(latent + NUM_TIMES,),
     )
 
 
@@ -423,7 +428,7 @@ def _stage(  # noqa: PLR0913 - the terms of the loss
     smooth_weight: float = 300.0,
     step_weight: float = 20_000.0,
     kl_weight: float = 0.1,
-    told: tuple[float, float] = (0.5, 1.0),
+    told: tuple[float, float] = (0.0, 1.0),
 ) -> Stage:
     return Stage(
         name="vae",

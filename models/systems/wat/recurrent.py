@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-CLOCK = 16
-"""Sines and cosines that tell the unit how many steps an action is old, periods 4 to 512."""
+from models.systems.wat.timing import NUM_TIMES, Clock
 
 
 class TanhMLP(nn.Sequential):
@@ -35,7 +34,6 @@ class RecurrentVAE(nn.Module):
     """Tensors of `begin` that stay as they are while an action goes on."""
     carried = ("hidden", "latest_frame", "steps")
     """Tensors of `begin` that `advance` replaces."""
-    clock_rate: Tensor
 
     def __init__(
         self,
@@ -54,14 +52,13 @@ class RecurrentVAE(nn.Module):
         self.observed = nn.GRU(patch, hidden, batch_first=True)
         self.performed = nn.GRU(patch, hidden, batch_first=True)
         self.prior_network = nn.Sequential(
-            TanhMLP(2 * hidden, *widths), nn.Linear(widths[-1], 2 * latent)
+            TanhMLP(2 * hidden, *widths), nn.Linear(widths[-1], 2 * (latent + NUM_TIMES))
         )
         self.posterior_network = nn.Sequential(
             TanhMLP(3 * hidden, *widths), nn.Linear(widths[-1], 2 * latent)
         )
-        self.from_clock = nn.Linear(CLOCK, 3 * hidden, bias=False)
-        rate = torch.pi / 2 ** torch.arange(1, CLOCK // 2 + 1)
-        self.register_buffer("clock_rate", rate, persistent=False)
+        self.clock = Clock(frames_per_step)
+        self.from_clock = nn.Linear(self.clock.num_features, 3 * hidden, bias=False)
         self.first_hidden = TanhMLP(hidden, hidden)
         self.from_request = nn.Linear(2 * hidden + latent, 3 * hidden)
         self.from_frame = nn.Linear(features, 3 * hidden, bias=False)
@@ -72,8 +69,8 @@ class RecurrentVAE(nn.Module):
 
     def prior(
         self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
-    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
-        """Mean and log variance of z before the future is known."""
+    ) -> tuple[Float[Tensor, "B Z"], Float[Tensor, "B Z"]]:
+        """Mean and log variance of z, timing included, before the future is known."""
         joined = torch.cat([self._code(observed), self.action(action)], dim=1)
         mean, log_variance = self.prior_network(joined).chunk(2, dim=1)
         return mean, log_variance
@@ -103,18 +100,17 @@ class RecurrentVAE(nn.Module):
 
     def advance(
         self,
-        z: Float[Tensor, "B D"],
+        z: Float[Tensor, "B Z"],
         state: tuple[Tensor, ...],
         num_frames: int,
         told: Told | None = None,
     ) -> tuple[Float[Tensor, "B L F"], tuple[Tensor, ...]]:
         """The next frames, and the tensors of ``carried`` after them."""
         code, action, hidden, latest, steps = state
-        fixed = self.from_request(torch.cat([code, action, z], dim=1))
+        fixed = self.from_request(torch.cat([code, action, z[:, :-NUM_TIMES]], dim=1))
         patches = []
         for start in range(0, num_frames, self.frames_per_step):
-            angle = steps * self.clock_rate
-            clock = self.from_clock(torch.cat([angle.sin(), angle.cos()], dim=1))
+            clock = self.from_clock(self.clock(steps, z[:, -NUM_TIMES:]))
             hidden = self._cell(fixed + clock + self.from_frame(latest), hidden)
             steps = steps + 1.0
             patch = self.output(hidden).unflatten(1, (self.frames_per_step, -1)) + latest[:, None]

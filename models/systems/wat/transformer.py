@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from models.systems.wat.timing import NUM_TIMES, Clock
+
 
 class Layer(nn.Module):
     """A post-norm Transformer layer whose attention may see condition tokens too.
@@ -137,6 +139,9 @@ class TransformerVAE(nn.Module):
             )
             for _ in range(3)
         )
+        self.timing = nn.Linear(width, 2 * NUM_TIMES)
+        self.clock = Clock(frames_per_step)
+        self.from_clock = nn.Linear(self.clock.num_features, width)
         self.output = nn.Linear(width, patch)
         nn.init.normal_(self.output.weight, std=1e-3)
         nn.init.zeros_(self.output.bias)
@@ -147,10 +152,13 @@ class TransformerVAE(nn.Module):
 
     def prior(
         self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
-    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
-        """Mean and log variance of z before the future is known."""
+    ) -> tuple[Float[Tensor, "B Z"], Float[Tensor, "B Z"]]:
+        """Mean and log variance of z, timing included, before the future is known."""
         everything = self.may_see[None, -1:, : 2 + self.num_observed]
-        return self._summarised(self.prior_stack, self.prior_summary(action), observed, everything)
+        summary = self.prior_summary(action)
+        mean, log_variance = self._summarised(self.prior_stack, summary, observed, everything)
+        time, time_log_variance = self.timing(mean).chunk(2, dim=1)
+        return torch.cat([mean, time], 1), torch.cat([log_variance, time_log_variance], 1)
 
     def posterior(
         self,
@@ -176,7 +184,7 @@ class TransformerVAE(nn.Module):
 
     def advance(
         self,
-        z: Float[Tensor, "B D"],
+        z: Float[Tensor, "B Z"],
         state: tuple[Tensor, ...],
         num_frames: int,
         told: object = None,
@@ -187,8 +195,13 @@ class TransformerVAE(nn.Module):
         last = observed[:, -1:]
         padded = torch.cat([observed, last.expand(-1, num_frames, -1)], dim=1)
         tokens = self.decoder_stack.tokens(self._patches(padded))
+        count = num_frames // self.frames_per_step
+        timing = z[:, None, -NUM_TIMES:].expand(-1, count, -1)
+        age = torch.arange(count, device=z.device, dtype=z.dtype)[:, None]
+        clock = self.from_clock(self.clock(age.expand_as(timing[..., :1]), timing))
+        tokens = torch.cat([tokens[:, :-count], tokens[:, -count:] + clock], dim=1)
         may_see = self.may_see[None, : tokens.shape[1], : 2 + tokens.shape[1]]
-        seen = self.decoder_stack(tokens, may_see, torch.stack([z, action], dim=1))
+        seen = self.decoder_stack(tokens, may_see, torch.stack([z[:, :-NUM_TIMES], action], dim=1))
         patches = self.output(seen[:, self.num_observed :])
         return patches.unflatten(2, (self.frames_per_step, -1)).flatten(1, 2) + last, ()
 
