@@ -10,10 +10,12 @@ import hashlib
 import json
 import shutil
 import tempfile
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from models.diffusion import Schedule
@@ -86,9 +88,9 @@ class ActionsSpec(_Record):
 
     Its decoder gives ``chunk_frames`` frames at a time; what it returns as ``next_<name>`` is its
     input ``<name>`` for the chunk after. An action ends at the first frame, not before
-    ``min_frames`` (or what ``shortest`` says of its label), from which ``stop_window`` frames stay
-    within ``stop_threshold_m`` of their mean (Mao et al. 2022, Eq. 8, over all joints in metres),
-    or after ``horizon`` frames.
+    ``min_frames`` nor before what the decoder gives as ``earliest_end``, if it does, from which
+    ``stop_window`` frames stay within ``stop_threshold_m`` of their mean (Mao et al. 2022, Eq. 8,
+    over all joints in metres), or after ``horizon`` frames.
     """
 
     labels: tuple[str, ...] = Field(min_length=1)
@@ -96,10 +98,36 @@ class ActionsSpec(_Record):
     """For some labels, what a person does who performs it."""
     chunk_frames: int = Field(gt=0)
     min_frames: int = Field(default=1, gt=0)
-    shortest: dict[str, int] = Field(default_factory=dict)
-    """Labels whose least number of frames is not ``min_frames``."""
     stop_window: int = Field(default=5, gt=1)
     stop_threshold_m: float = Field(gt=0)
+
+
+class CalibrationSpec(_Record):
+    """How much wider than its samples' spread a bundle's regions must be to hold the truth.
+
+    ``factors[l][t]`` multiplies the radius of level l at ``times_s[t]`` after the last observed
+    frame; between two times it is interpolated, beyond them it stays. Measured with whole chains
+    of ``num_samples`` samples on ``num_windows`` windows of the clips ``measured_on``.
+    """
+
+    levels: tuple[Annotated[float, Field(gt=0.0, lt=1.0)], ...] = Field(min_length=1)
+    times_s: tuple[Annotated[float, Field(gt=0.0)], ...] = Field(min_length=1)
+    factors: tuple[tuple[Annotated[float, Field(gt=0.0, allow_inf_nan=False)], ...], ...]
+    num_samples: int = Field(gt=0)
+    num_windows: int = Field(gt=0)
+    measured_on: tuple[str, ...]
+
+    @model_validator(mode="after")
+    def _a_factor_for_each_level_and_time(self) -> "CalibrationSpec":
+        if [len(row) for row in self.factors] != [len(self.times_s)] * len(self.levels):
+            raise ValueError("factors: there must be a row for each level, of one for each time.")
+        if any(b <= a for a, b in pairwise(self.times_s)):
+            raise ValueError("times_s: must increase.")
+        return self
+
+    def at(self, level: float, times_s: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
+        """The factors of one of the levels at some times."""
+        return np.asarray(np.interp(times_s, self.times_s, self.factors[self.levels.index(level)]))
 
 
 class Manifest(_Record):
@@ -122,6 +150,7 @@ class Manifest(_Record):
     x_t_shape: tuple[int, ...] = ()
     """Of a row's noise: x_t where there is a denoiser, else what a graph asks for as ``noise``."""
     actions: ActionsSpec | None = None
+    calibration: CalibrationSpec | None = None
     encoder: GraphSpec | None = None
     denoiser: GraphSpec | None = None
     decoder: GraphSpec
@@ -163,7 +192,10 @@ class Manifest(_Record):
     @property
     def digest(self) -> str:
         """Short sha256 over the graphs and the tables: two bundles that answer alike share it."""
-        body = self.model_dump(mode="json", exclude={"recipe", "training", "description"})
+        silent = {"recipe", "training", "description"}
+        if self.calibration is None:
+            silent.add("calibration")  # bundles of before there was any keep their digest
+        body = self.model_dump(mode="json", exclude=silent)
         return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -223,7 +255,25 @@ def write_bundle(folder: Path, manifest: Manifest, files: dict[str, bytes]) -> N
             (new / name).write_bytes(content)
         for graph in manifest.graphs().values():
             _verify(new / graph.file, graph.sha256)
-        (new / MANIFEST_FILE).write_text(manifest.model_dump_json(indent=1) + "\n")
+        (new / MANIFEST_FILE).write_text(_as_text(manifest))
         if folder.exists():
             shutil.move(folder, Path(scratch) / "old")
         new.rename(folder)
+
+
+def write_calibration(folder: Path, calibration: CalibrationSpec) -> Manifest:
+    """Put a calibration into the manifest of a folder, whole or not at all; return the manifest.
+
+    Raises:
+        BundleError: the folder holds no bundle that can be used.
+    """
+    manifest = read_manifest(folder).model_copy(update={"calibration": calibration})
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".writing-") as scratch:
+        new = Path(scratch) / MANIFEST_FILE
+        new.write_text(_as_text(manifest))
+        new.replace(folder / MANIFEST_FILE)
+    return manifest
+
+
+def _as_text(manifest: Manifest) -> str:
+    return manifest.model_dump_json(indent=1) + "\n"

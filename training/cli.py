@@ -1,4 +1,4 @@
-"""Command line ``posefutures-train``: prepare, train, export, evaluate; actions are judged too."""
+"""Command line ``posefutures-train``: prepare, train, export, evaluate, calibrate bundles."""
 
 import importlib
 import shlex
@@ -18,6 +18,7 @@ from models.motion.skeleton import SKELETONS
 from models.system import Recipe
 from service.errors import ServiceError
 from training.action_classifier import classifier_recipe, read_judge
+from training.calibrate import calibrate
 from training.checkpoint import CheckpointError
 from training.contact_sheet import action_sheet, contact_sheet
 from training.data.batches import training_clips
@@ -28,6 +29,7 @@ from training.evaluate import EvaluateError, evaluate
 from training.evaluate_actions import evaluate_actions
 from training.export import ExportError, Label, export
 from training.loop import RunError, train, trained_network
+from training.step_curve import step_curve
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -50,6 +52,9 @@ RecipeArgument = Annotated[
 ]
 StoreOption = Annotated[Path, typer.Option(help="Folder made by prepare.")]
 BundlesArgument = Annotated[list[Path], typer.Argument(help="Folders of bundles to compare.")]
+BundleArgument = Annotated[Path, typer.Argument(help="Folder of the bundle.")]
+HoldOption = Annotated[list[str], typer.Option(help="Clips that the bundle has not learnt.")]
+StrideOption = Annotated[int, typer.Option(help="Frames between windows.")]
 SeedOption = Annotated[int, typer.Option(help="Of the samples.")]
 
 
@@ -184,7 +189,7 @@ def evaluate_command(
     ],
     num_samples: Annotated[int, typer.Option(help="Futures for each window.")] = 50,
     num_steps: Annotated[int | None, typer.Option(help="Stop after so many steps.")] = None,
-    stride: Annotated[int, typer.Option(help="Frames between windows.")] = 10,
+    stride: StrideOption = 10,
     max_windows: Annotated[int, typer.Option(help="Windows of a group at most.")] = 300,
     seed: SeedOption = 0,
     sheet: Annotated[Path | None, typer.Option(help="Also draw ten windows to this PNG.")] = None,
@@ -209,6 +214,64 @@ def evaluate_command(
     if sheet:
         contact_sheet(bundles[0], opened, select(opened.clips, next(iter(groups.values()))), sheet)
     typer.echo(f"{time.monotonic() - started:.0f} s", err=True)
+
+
+@app.command("calibrate")
+def calibrate_command(
+    bundle: BundleArgument,
+    store: StoreOption,
+    hold: HoldOption,
+    group: Annotated[
+        list[str] | None,
+        typer.Option(help="name:selector[,selector…] of other clips to report on."),
+    ] = None,
+    samples: Annotated[int, typer.Option(help="Futures for each window.")] = 50,
+    stride: StrideOption = 15,
+    max_windows: Annotated[int, typer.Option(help="Windows of a group at most.")] = 600,
+    seed: SeedOption = 0,
+) -> None:
+    """Measure what a bundle's regions cover; write what makes them hold into its manifest."""
+    calibrated = calibrate(
+        bundle,
+        open_store(store),
+        hold,
+        groups=dict(_group(text) for text in group or ()),
+        num_samples=samples,
+        stride=stride,
+        max_windows=max_windows,
+        seed=seed,
+        command=_command(),
+    )
+    typer.echo(calibrated)
+    typer.echo(f"{bundle}: calibrated, digest {calibrated.manifest.digest}")
+
+
+@app.command("steps")
+def steps_command(
+    bundle: BundleArgument,
+    store: StoreOption,
+    hold: HoldOption,
+    out: Annotated[Path, typer.Option(help="Folder for steps_<bundle>.md, .json and .png.")],
+    samples: Annotated[int, typer.Option(help="Futures for each window.")] = 50,
+    stride: StrideOption = 15,
+    max_windows: Annotated[int, typer.Option(help="Windows at most.")] = 200,
+    rounds: Annotated[int, typer.Option(help="How often each number of steps is timed.")] = 25,
+    seed: SeedOption = 0,
+) -> None:
+    """Measure what stopping after fewer denoising steps costs in quality and saves in time."""
+    curve = step_curve(
+        bundle,
+        open_store(store),
+        hold,
+        out=out,
+        num_samples=samples,
+        stride=stride,
+        max_windows=max_windows,
+        rounds=rounds,
+        seed=seed,
+        command=_command(),
+    )
+    typer.echo(curve)
 
 
 def _command() -> str:

@@ -115,11 +115,15 @@ def _draw_row(row: np.ndarray, side: Float[np.ndarray, "N poses J 2"], skeleton:
 def _save(figure: Figure, first_row: np.ndarray, titles: Sequence[str], out: Path) -> None:
     for axes, title in zip(first_row, titles, strict=True):
         axes.set_title(title, fontsize=9)
+    save_small(figure, out)
+
+
+def save_small(figure: Figure, out: Path) -> None:
+    """Write a figure as a PNG that is small enough to be committed: of a few colours."""
     out.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
     buffer = BytesIO()
     figure.savefig(buffer, dpi=72)
-    # A palette keeps the file small enough to be committed.
     Image.open(buffer).convert("RGB").quantize(PALETTE).save(out, optimize=True)
 
 

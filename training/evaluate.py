@@ -37,7 +37,9 @@ class EvaluateError(Exception):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Cutting:
+class Cutting:
+    """How windows are cut from clips, in frames; of more than ``max_windows``, an even spread."""
+
     num_observed: int
     horizon: int
     stride: int
@@ -45,7 +47,9 @@ class _Cutting:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Group:
+class Group:
+    """Windows of some clips, to be asked for."""
+
     name: str
     windows: TestWindows
     owners: tuple[ClipRecord, ...]
@@ -92,11 +96,11 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
         EngineError: a bundle cannot be run.
     """
     num_observed, horizon = common_shape([manifest for _, manifest in bundles], store)
-    cutting = _Cutting(
+    cutting = Cutting(
         num_observed=num_observed, horizon=horizon, stride=stride, max_windows=max_windows
     )
     tests = [
-        _group(name, select(store.clips, tuple(chosen)), store, cutting)
+        cut_group(name, select(store.clips, tuple(chosen)), store, cutting)
         for name, chosen in groups.items()
     ]
     data = {manifest.name: learnt_from(manifest, store) for _, manifest in bundles}
@@ -158,7 +162,13 @@ def common_shape(manifests: Sequence[Manifest], store: Store) -> tuple[int, int]
     return shapes.pop()
 
 
-def _group(name: str, clips: tuple[ClipRecord, ...], store: Store, cutting: _Cutting) -> _Group:
+def cut_group(name: str, clips: tuple[ClipRecord, ...], store: Store, cutting: Cutting) -> Group:
+    """Windows of clips.
+
+    Raises:
+        EvaluateError: there are no clips.
+        StoreError: none of them is long enough.
+    """
     if not clips:
         raise EvaluateError(f"{name}: found no clip of this group in the store.")
     num_observed, num_frames = cutting.num_observed, cutting.num_observed + cutting.horizon
@@ -167,7 +177,7 @@ def _group(name: str, clips: tuple[ClipRecord, ...], store: Store, cutting: _Cut
     indices = np.linspace(0, len(windows) - 1, count).round().astype(np.int64)
     poses = cut(store, windows, num_frames=num_frames, indices=indices)
     owners = tuple(clips[i] for i in windows.clip_index[indices])
-    return _Group(
+    return Group(
         name=name,
         owners=owners,
         windows=TestWindows(
@@ -187,7 +197,7 @@ def learnt_from(manifest: Manifest, store: Store) -> Data | None:
 
 
 def _bank(
-    store: Store, data: Mapping[str, Data | None], tests: Sequence[_Group], *, num_frames: int
+    store: Store, data: Mapping[str, Data | None], tests: Sequence[Group], *, num_frames: int
 ) -> Windows:
     """The windows that retrieval may look at."""
     known = [one for one in data.values() if one is not None]
@@ -206,7 +216,7 @@ def _bank(
 
 
 def _group_rows(
-    group: _Group,
+    group: Group,
     predictors: Mapping[str, Predictor],
     store: Store,
     bones: Sequence[BoneLengths],

@@ -1,10 +1,19 @@
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from models.bundle import Manifest, ManifestError, read_manifest
+from models.bundle import (
+    CalibrationSpec,
+    Manifest,
+    ManifestError,
+    read_manifest,
+    write_calibration,
+)
 
 
 def changed(folder: Path, **fields: Any) -> Manifest:
@@ -56,3 +65,60 @@ def test_file_that_is_wrong_of_its_actions_says_where(actions_bundle: Path, tmp_
     (tmp_path / "manifest.json").write_text(text.replace('"chunk_frames":8', '"chunk_frames":-8'))
     with pytest.raises(ManifestError, match=r"actions\.chunk_frames"):
         read_manifest(tmp_path)
+
+
+CALIBRATION = CalibrationSpec(
+    levels=(0.5, 0.9),
+    times_s=(0.1, 0.3),
+    factors=((1.0, 2.0), (3.0, 1.0)),
+    num_samples=50,
+    num_windows=100,
+    measured_on=("split=valid",),
+)
+
+
+def test_calibration_is_written_beside_what_was_there(bundles: Path, tmp_path: Path):
+    folder = shutil.copytree(bundles / "diffusion", tmp_path / "diffusion")
+    before = read_manifest(folder)
+    written = write_calibration(folder, CALIBRATION)
+    assert read_manifest(folder) == written
+    assert written.calibration == CALIBRATION
+    assert written.model_copy(update={"calibration": None}) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["diffusion"]
+    assert {path.name for path in folder.iterdir()} == {
+        path.name for path in (bundles / "diffusion").iterdir()
+    }
+
+
+def test_bundle_answers_otherwise_once_it_is_calibrated(bundles: Path):
+    before = read_manifest(bundles / "diffusion")
+    assert changed(bundles / "diffusion", calibration=CALIBRATION).digest != before.digest
+
+
+def test_manifest_of_before_calibration_keeps_its_digest(bundles: Path, tmp_path: Path):
+    folder = shutil.copytree(bundles / "diffusion", tmp_path / "diffusion")
+    path = folder / "manifest.json"
+    content = json.loads(path.read_text())
+    del content["calibration"]
+    path.write_text(json.dumps(content))
+    assert read_manifest(folder).digest == read_manifest(bundles / "diffusion").digest
+
+
+def test_factors_are_interpolated_and_stay_beyond_their_times():
+    factors = CALIBRATION.at(0.9, np.array([0.01, 0.1, 0.2, 0.3, 9.0]))
+    np.testing.assert_allclose(factors, [3.0, 3.0, 2.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"factors": ((1.0, 2.0),)}, "a row for each level"),
+        ({"factors": ((1.0,), (1.0,))}, "one for each time"),
+        ({"factors": ((1.0, 2.0), (1.0, float("inf")))}, "finite"),
+        ({"times_s": (0.3, 0.1)}, "must increase"),
+        ({"levels": (0.5, 1.0)}, "less than 1"),
+    ],
+)
+def test_calibration_that_cannot_be_is_refused(fields: dict[str, Any], message: str):
+    with pytest.raises(ValidationError, match=message):
+        CalibrationSpec.model_validate(CALIBRATION.model_dump() | fields)

@@ -16,6 +16,10 @@ FLAGS = {
     | {"--machine"},
     "evaluate": {"--store", "--out", "--group", "--num-samples", "--num-steps", "--stride"}
     | {"--max-windows", "--seed", "--sheet"},
+    "calibrate": {"--store", "--hold", "--group", "--samples", "--stride", "--max-windows"}
+    | {"--seed"},
+    "steps": {"--store", "--hold", "--out", "--samples", "--stride", "--max-windows", "--rounds"}
+    | {"--seed"},
     "classifier": {"--store", "--out", "--updates"},
     "evaluate-actions": {"--store", "--classifier", "--out", "--hold", "--samples", "--histories"}
     | {"--actions-in-sequence", "--seed", "--sheet"},
