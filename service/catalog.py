@@ -1,9 +1,11 @@
 """The bundles of a folder: loaded and warmed up one by one, each ready or refused by itself."""
 
 import logging
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Literal
 
@@ -17,20 +19,25 @@ from models.bundle import (
     ManifestError,
     read_manifest,
 )
-from service.engine.engine import Engine, predict
+from service.engine.engine import ROWS_PER_STEP, Engine, predict
 from service.engine.runner import Runner
-from service.engine.trajectory import Request
+from service.engine.trajectory import Request, Result
 from service.errors import (
     EngineError,
     UnavailableError,
     UnknownModelError,
     UnsuitableModelError,
 )
-from service.worker import Worker
+from service.worker import Limits, Worker
 
 DEFAULT_FILE = "DEFAULT"
+GOLDEN_SAMPLES = 4
 
 _log = logging.getLogger(__name__)
+
+
+def _unlimited(engine: Engine) -> Worker:
+    return Worker(engine, limits=Limits(max_requests=sys.maxsize, max_rows=sys.maxsize))
 
 
 @dataclass(kw_only=True, slots=True, eq=False)
@@ -42,6 +49,8 @@ class Entry:
     reason: str | None = None
     manifest: Manifest | None = None
     card: str = ""
+    golden_digest: str | None = None
+    """sha256 of the futures of the bundle's golden request, in hexadecimal."""
     worker: Worker | None = field(default=None, repr=False)
 
     def answers(self, *, with_actions: bool) -> bool:
@@ -53,9 +62,28 @@ class Entry:
 class Catalog:
     """Every bundle of a folder by name, with its manifest; answers while it still loads."""
 
-    def __init__(self, folder: Path, *, default_model: str | None, threads: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        default_model: str | None,
+        threads: int = 1,
+        rows_per_step: int = ROWS_PER_STEP,
+        worker: Callable[[Engine], Worker] = _unlimited,
+    ) -> None:
+        """Read the manifests.
+
+        Args:
+            folder: where the bundles are.
+            default_model: the preferred bundle; None leaves it to the folder.
+            threads: cores of one call of a graph.
+            rows_per_step: the most rows of one step.
+            worker: starts a bundle's worker on its engine.
+        """
         self._folder = folder
         self._threads = threads
+        self._rows_per_step = rows_per_step
+        self._worker = worker
         self.entries = {name: Entry(name=name) for name in bundle_names(folder)}
         names = [default_model] if default_model else _preferred(folder, list(self.entries))
         self._preferred = [self.entry(name) for name in names]
@@ -161,13 +189,19 @@ class Catalog:
         """
         if entry.manifest is None:
             raise _refused(entry)
-        return Engine(Runner(entry.manifest, self._folder / entry.name, threads=self._threads))
+        runner = Runner(entry.manifest, self._folder / entry.name, threads=self._threads)
+        return Engine(runner, rows_per_step=self._rows_per_step)
 
     def performers(self) -> dict[str, ActionsSpec]:
         """What the bundles that perform actions know, by name, the default one first."""
         default = self.default(with_actions=True)
         ordered = sorted(self._of_kind(with_actions=True), key=lambda e: e is not default)
         return {e.name: e.manifest.actions for e in ordered if e.manifest and e.manifest.actions}
+
+    def seconds_until_free(self) -> float:
+        """When the busiest bundle will probably have answered a request."""
+        workers = [entry.worker for entry in self.entries.values() if entry.worker is not None]
+        return max((worker.seconds_until_free() for worker in workers), default=0.0)
 
     def stop(self) -> None:
         """Stop every worker; what they had not finished fails."""
@@ -185,8 +219,8 @@ class Catalog:
 
     def _load(self, entry: Entry) -> None:
         engine = self.engine(entry)
-        warm_up(engine)
-        entry.worker = Worker(engine)
+        entry.golden_digest = warm_up(engine)
+        entry.worker = self._worker(engine)
         entry.state = "ready"
 
 
@@ -199,6 +233,9 @@ def _refused_on_error(entry: Entry) -> Iterator[None]:
     except OSError as error:  # its text holds the whole path, which is nobody's business
         entry.reason = f"{entry.name}: a file cannot be read: {error.strerror}."
         entry.state = "refused"
+    except Exception:  # noqa: BLE001 - the loader's outermost loop: the other bundles must load
+        _log.exception("bundle %s could not be loaded", entry.name)
+        entry.reason, entry.state = f"{entry.name}: an unforeseen error.", "refused"
 
 
 def _refused(entry: Entry) -> UnavailableError:
@@ -228,17 +265,39 @@ def read_bundle(folder: Path) -> tuple[Manifest, str]:
     return manifest, text
 
 
-def warm_up(engine: Engine) -> None:
-    """Run every graph, on a body that stands still and, where it can, performs the first action.
+def warm_up(engine: Engine) -> str:
+    """Run every graph, and return the sha256 of the golden request's futures.
+
+    It is a body that stands still and, where it can, performs the first action; it runs alone, and
+    among other requests.
 
     Raises:
-        EngineError: a graph does not run, or gives NaN.
+        EngineError: a graph does not run, gives NaN, or other bytes among other requests.
     """
     manifest = engine.manifest
     generator = np.random.Generator(np.random.Philox(key=[0, 0]))
-    pose = generator.uniform(0.0, 1.0, (len(manifest.skeleton.joints), 3)).astype(np.float32)
-    observation = np.repeat(pose[None], manifest.num_observed, axis=0)
-    predict(engine, Request(observation=observation, actions=(0,) if manifest.actions else ()))
+
+    def standing(num_samples: int) -> Request:
+        pose = generator.uniform(0.0, 1.0, (1, len(manifest.skeleton.joints), 3))
+        return Request(
+            observation=pose.astype(np.float32).repeat(manifest.num_observed, axis=0),
+            num_samples=num_samples,
+            actions=(0,) if manifest.actions else (),
+        )
+
+    golden, *strangers = (standing(num_samples) for num_samples in (GOLDEN_SAMPLES, 1, 7))
+    digest = _digest(predict(engine, golden))
+    *_, among = engine.run([*strangers, golden])
+    if _digest(among) != digest:
+        raise EngineError(
+            f"{manifest.name}: the golden request gave other futures among other requests; "
+            "a row must not depend on its batch."
+        )
+    return digest
+
+
+def _digest(result: Result) -> str:
+    return sha256(result.futures.tobytes()).hexdigest()
 
 
 def _preferred(folder: Path, names: list[str]) -> list[str]:

@@ -28,8 +28,27 @@ def check(request: Request, manifest: Manifest) -> None:
             found=str(request.num_steps),
             expected=f"{manifest.name} runs 1 to {manifest.num_steps} steps",
         )
+    _check_length(request, manifest)
     _check_actions(request, manifest)
     _check_stop(request, manifest)
+
+
+def _check_length(request: Request, manifest: Manifest) -> None:
+    horizon, tolerance_m = request.horizon, request.tolerance_m
+    if horizon is not None and (manifest.actions or horizon < 1):
+        longest = "performs actions, which have lengths of their own"
+        raise FieldError(
+            pointer="/horizon_s",
+            found=f"{horizon / manifest.fps:g} s",
+            expected=f"{manifest.name} {longest if manifest.actions else 'makes a frame or more'}",
+        )
+    if tolerance_m is not None and (manifest.actions or not tolerance_m > 0):
+        settles = "performs actions in one step each"
+        raise FieldError(
+            pointer="/tolerance_m",
+            found=f"{tolerance_m:g} m",
+            expected=f"{manifest.name} {settles if manifest.actions else 'takes more than 0'}",
+        )
 
 
 def _check_actions(request: Request, manifest: Manifest) -> None:

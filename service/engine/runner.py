@@ -1,6 +1,7 @@
 """The one door to onnxruntime: loads a bundle's graphs and wires them by tensor name."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -8,16 +9,20 @@ import onnxruntime as ort  # type: ignore[import-untyped]  # ships no stubs
 from jaxtyping import Shaped
 
 from models.bundle import Manifest
-from service.engine.context import Context, Tensors, distinct, gathered
+from service.engine.context import Context, Part, Tensors, gathered, unencoded
 from service.errors import GraphError, NonFiniteError
 
 
 class Runner:
-    """The graphs of one bundle, ready to run; keeps no state of any request."""
+    """The graphs of one bundle, ready to run from several threads; keeps no state."""
 
     def __init__(self, manifest: Manifest, folder: Path, *, threads: int = 1) -> None:
         self.manifest = manifest
         self._graphs = manifest.graphs()
+        self._names = {
+            role: (tuple(t.name for t in graph.inputs), tuple(t.name for t in graph.outputs))
+            for role, graph in self._graphs.items()
+        }
         self._sessions = {
             role: _session(folder / graph.file, threads=threads)
             for role, graph in self._graphs.items()
@@ -31,27 +36,35 @@ class Runner:
     def encode(self, contexts: Sequence[Context]) -> None:
         """Add what the encoder gives to those contexts that lack it, in one batch.
 
+        Where another thread encodes one of them, this waits for it.
+
         Raises:
             EngineError: the encoder cannot run, or gives NaN; no context is changed then.
         """
-        waiting = [context for context in distinct(contexts) if not context.encoded]
-        if waiting and "encoder" in self._graphs:
-            outputs = self.run("encoder", {}, waiting)
-            for i, context in enumerate(waiting):
-                context.tensors |= {name: rows[i : i + 1] for name, rows in outputs.items()}
-        for context in waiting:
-            context.encoded = True
+        with ExitStack() as held:
+            # One order for all threads, so that no two wait for each other.
+            for context in sorted(unencoded(contexts), key=id):
+                held.enter_context(context.lock)
+            waiting = unencoded(contexts)
+            if waiting and "encoder" in self._graphs:
+                outputs = self.run("encoder", {}, [(context, len(context)) for context in waiting])
+                start = 0
+                for context in waiting:
+                    end = start + len(context)
+                    context.tensors |= {name: rows[start:end] for name, rows in outputs.items()}
+                    start = end
+            for context in waiting:
+                context.encoded = True
 
-    def run(self, role: str, tensors: Tensors, contexts: Sequence[Context]) -> Tensors:
+    def run(self, role: str, tensors: Tensors, parts: Sequence[Part]) -> Tensors:
         """What a graph makes of a batch of rows: of their own tensors and their contexts'.
 
         Raises:
             GraphError: the graph cannot run, or asks for a tensor that nothing gives.
             NonFiniteError: it gives NaN or infinity.
         """
-        graph = self._graphs[role]
-        asked = [spec.name for spec in graph.inputs]
-        given = gathered([name for name in asked if name not in tensors], contexts) | tensors
+        asked, names = self._names[role]
+        given = gathered([name for name in asked if name not in tensors], parts) | tensors
         missing = [name for name in asked if name not in given]
         if missing:
             raise GraphError(
@@ -59,7 +72,6 @@ class Runner:
                 "which no earlier graph gives."
             )
         feed = {name: _two_or_more(given[name]) for name in asked}
-        names = [output.name for output in graph.outputs]
         try:
             outputs = dict(zip(names, self._sessions[role].run(names, feed), strict=True))
         except _ORT_ERRORS as error:
@@ -70,7 +82,8 @@ class Runner:
                     f"{self.manifest.name}: the {role} gave NaN or infinity in {name}; "
                     "the observation is unlike anything this model was made for."
                 )
-        return {name: output[: len(contexts)] for name, output in outputs.items()}
+        num_rows = sum(count for _, count in parts)
+        return {name: output[:num_rows] for name, output in outputs.items()}
 
 
 def _two_or_more(rows: Shaped[np.ndarray, "B ..."]) -> Shaped[np.ndarray, "C ..."]:

@@ -1,50 +1,174 @@
-"""Who goes next: row by row in turn among the requests, so that none waits for a larger one."""
+"""Who goes next: the tightest deadline, then the least work left, and a share for everybody.
 
+A turn runs at most ``rows_per_step`` rows, and no more than its thread's share of all that are
+under way. Half of it goes to requests in the order of
+
+1. their deadlines, where these are tight: the work left would take half of the time left or more;
+2. their work left, turns times rows, so that a short request passes the long ones, and of equal
+   ones that which came first ends first;
+3. their arrival.
+
+The other half goes row by row in turn among all requests that have rows to spare, to the one that
+has waited longest for such a row first, so that none starves. Within a request the rows that have
+waited longest go first, and its samples advance together.
+"""
+
+import math
 from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic
 
-from service.engine.trajectory import Trajectory
+from service.engine.rows import RowsT
 
 
-class Scheduler:
-    """Queues of trajectories, one per request; it looks at no array."""
+@dataclass(kw_only=True, slots=True, eq=False)
+class _Queue(Generic[RowsT]):
+    """A request: the rows of it that wait, and what is known of those that a turn runs."""
+
+    request_id: int
+    deadline_s: float
+    waiting: deque[RowsT] = field(default_factory=deque)
+    num_waiting: int = 0
+    num_running: int = 0
+    work: int = 0
+    last_share: int = -1
+    removed: bool = False
+
+    def popped(self, count: int) -> list[RowsT]:
+        """So many of the rows that have waited longest."""
+        self.num_waiting -= count
+        self.num_running += count
+        popped: list[RowsT] = []
+        while count:
+            rows = self.waiting.popleft()
+            if len(rows) > count:
+                rows, rest = rows.split(count)
+                self.waiting.appendleft(rest)
+            popped.append(rows)
+            count -= len(rows)
+        return popped
+
+
+class Scheduler(Generic[RowsT]):
+    """The rows of every request, those that wait and those that run; it looks at no array."""
 
     def __init__(self, *, rows_per_step: int) -> None:
         if rows_per_step < 1:
             raise ValueError(f"rows_per_step: found {rows_per_step}; must be 1 or more.")
         self._rows_per_step = rows_per_step
-        self._queues: dict[int, deque[Trajectory]] = {}
-        self._turns: deque[int] = deque()
+        self._queues: dict[int, _Queue[RowsT]] = {}
+        self._num_shares = 0
+        self.num_waiting = 0
+        self.num_running = 0
 
-    def __len__(self) -> int:
-        """How many trajectories wait."""
-        return sum(map(len, self._queues.values()))
+    @property
+    def num_rows(self) -> int:
+        """How many rows wait or run."""
+        return self.num_waiting + self.num_running
 
-    def put(self, trajectory: Trajectory) -> None:
-        """Queue a trajectory behind the others of its request."""
-        request_id = trajectory.request_id
-        if request_id not in self._queues:
-            self._queues[request_id] = deque()
-            self._turns.append(request_id)
-        self._queues[request_id].append(trajectory)
+    @property
+    def num_requests(self) -> int:
+        """How many requests have rows, those included that were removed and still run."""
+        return len(self._queues)
 
-    def take(self) -> list[Trajectory]:
-        """The next trajectories to run, grouped by request; at most ``rows_per_step`` of them.
+    def add(self, request_id: int, rows: Iterable[RowsT], *, deadline_s: float = math.inf) -> None:
+        """Queue all rows of a new request; its work should be done at this time."""
+        queue = self._queues[request_id] = _Queue(request_id=request_id, deadline_s=deadline_s)
+        for some in rows:
+            self._put(queue, some)
 
-        Requests give one row each in turn, and a later call goes on where this one stopped. Within
-        a request the row that has waited longest goes first, so its samples advance together.
+    def num_next(self, *, shares: int = 1) -> int:
+        """How many rows the next turn runs, one of so many threads' turns."""
+        share = math.ceil((self.num_waiting + self.num_running) / shares)
+        return min(self._rows_per_step, share, self.num_waiting)
+
+    def take(
+        self, *, shares: int = 1, now_s: float = 0.0, seconds_per_turn: float = 0.0
+    ) -> list[RowsT]:
+        """The rows to run next, grouped by request, until they are settled.
+
+        ``seconds_per_turn`` of a single row tell which deadlines are tight.
         """
-        taken: dict[int, list[Trajectory]] = {}
-        for _ in range(min(self._rows_per_step, len(self))):
-            request_id = self._turns.popleft()
-            queue = self._queues[request_id]
-            taken.setdefault(request_id, []).append(queue.popleft())
-            if queue:
-                self._turns.append(request_id)
-            else:
-                del self._queues[request_id]
-        return [trajectory for rows in taken.values() for trajectory in rows]
+
+        def order(queue: _Queue[RowsT]) -> tuple[float, int]:
+            tight = now_s + 2.0 * seconds_per_turn * queue.work >= queue.deadline_s
+            return (queue.deadline_s if tight else math.inf, queue.work)
+
+        total = self.num_next(shares=shares)
+        counts: dict[_Queue[RowsT], int] = {}
+        left = total - total // 2
+        waiting = sorted((q for q in self._queues.values() if q.num_waiting), key=order)
+        for queue in waiting:
+            counts[queue] = min(left, queue.num_waiting)
+            left -= counts[queue]
+        self._share(counts, total - sum(counts.values()))
+        taken = [rows for queue, count in counts.items() for rows in queue.popped(count)]
+        self.num_waiting -= total
+        self.num_running += total
+        return taken
+
+    def waiting(self, request_id: int) -> Sequence[RowsT]:
+        """The rows of one request that wait."""
+        return tuple(self._queues[request_id].waiting)
+
+    def take_of(self, request_id: int) -> list[RowsT]:
+        """All rows of one request that wait, until they are settled."""
+        queue = self._queues[request_id]
+        self.num_waiting -= queue.num_waiting
+        self.num_running += queue.num_waiting
+        return queue.popped(queue.num_waiting)
+
+    def settle(self, taken: Iterable[RowsT], following: Iterable[RowsT]) -> None:
+        """Put back what a turn made of the rows that it had taken."""
+        for rows in taken:
+            queue = self._queues[rows.request_id]
+            queue.num_running -= len(rows)
+            queue.work -= len(rows) * rows.turns_left
+            self.num_running -= len(rows)
+            self._forget(queue)
+        for rows in following:
+            if rows.request_id in self._queues and not self._queues[rows.request_id].removed:
+                self._put(self._queues[rows.request_id], rows)
 
     def remove(self, request_id: int) -> None:
-        """Forget what waits of a request."""
-        if self._queues.pop(request_id, None) is not None:
-            self._turns.remove(request_id)
+        """Forget what waits of a request, and what runs of it once that is settled."""
+        queue = self._queues.get(request_id)
+        if queue is None:
+            return
+        queue.work -= sum(len(rows) * rows.turns_left for rows in queue.waiting)
+        self.num_waiting -= queue.num_waiting
+        queue.num_waiting = 0
+        queue.waiting.clear()
+        queue.removed = True
+        self._forget(queue)
+
+    def work(self) -> Sequence[tuple[int, int]]:
+        """The turns left and the rows of each request, those first that probably end first."""
+        return sorted((q.work, q.num_waiting + q.num_running) for q in self._queues.values())
+
+    def _put(self, queue: _Queue[RowsT], rows: RowsT) -> None:
+        queue.waiting.append(rows)
+        queue.num_waiting += len(rows)
+        queue.work += len(rows) * rows.turns_left
+        self.num_waiting += len(rows)
+
+    def _share(self, counts: dict[_Queue[RowsT], int], left: int) -> None:
+        spare = deque(sorted((q for q in counts if counts[q] < q.num_waiting), key=_last_share))
+        while left:
+            queue = spare.popleft()
+            count = 1 if spare else left
+            counts[queue] += count
+            left -= count
+            self._num_shares += 1
+            queue.last_share = self._num_shares
+            if counts[queue] < queue.num_waiting:
+                spare.append(queue)
+
+    def _forget(self, queue: _Queue[RowsT]) -> None:
+        if queue.removed and not queue.num_running:
+            self._queues.pop(queue.request_id, None)
+
+
+def _last_share(queue: _Queue[Any]) -> int:
+    return queue.last_share

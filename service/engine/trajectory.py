@@ -2,10 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
+
+from service.engine.context import Context
+from service.engine.rows import Rows, SelfT
+from service.errors import ServiceError
+
+StoppedBy = Literal["end", "num_steps", "deadline", "tolerance"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -15,7 +21,11 @@ class Request:
     ``num_steps`` of the bundle's K denoising steps are run; None runs them all. ``actions`` are
     indices of the manifest's labels, performed one after the other; a bundle that performs actions
     needs one at least. ``stop_threshold_m`` and ``max_frames`` (of one action) are the manifest's
-    by default.
+    by default. At ``deadline_s``, on the engine's clock (``time.perf_counter``), the answer is what
+    is ready then. A sample stops as soon as a step moved no joint of its future by ``tolerance_m``.
+    Frames of the ``horizon`` beyond the bundle's come from legs that re-enter the last ones; a
+    bundle that performs actions takes neither. ``previews`` asks for a Preview after each step but
+    the last, which the Result follows.
     """
 
     observation: Float[np.ndarray, "T J 3"]
@@ -25,6 +35,10 @@ class Request:
     actions: tuple[int, ...] = ()
     stop_threshold_m: float | None = None
     max_frames: int | None = None
+    deadline_s: float | None = None
+    tolerance_m: float | None = None
+    horizon: int | None = None
+    previews: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -45,14 +59,28 @@ class Result:
     """N futures of a request, in metres in the world of its observation.
 
     Futures of actions differ in length: H is that of the longest, the others repeat their last
-    frame, and the end of a sample's last segment is its length.
+    frame, and the end of a sample's last segment is its length. Otherwise H is the horizon that was
+    asked for, or less where the deadline came before the last leg. ``steps_run`` are the most that
+    one row ran, of ``steps_of``, over all legs; ``queued_s`` passed before the first of them.
     """
 
     request_id: int
     futures: Float[np.ndarray, "N H J 3"]
     steps_run: int
     steps_of: int
+    stopped_by: StoppedBy = "end"
     segments: tuple[tuple[Segment, ...], ...] = ()
+    queued_s: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Preview:
+    """The futures of a request as they stand after a step: those that fewer steps would give."""
+
+    request_id: int
+    futures: Float[np.ndarray, "N H J 3"]
+    steps_run: int
+    steps_of: int
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,26 +88,44 @@ class Failure:
     """A request that could not be computed, and why."""
 
     request_id: int
-    error: Exception
+    error: ServiceError
+    queued_s: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Sample:
-    """One future of a request, whole."""
+class Samples:
+    """Futures of a request that are whole, after so many steps of each."""
 
     request_id: int
-    sample_index: int
-    future: Float[np.ndarray, "H J 3"]
-    segments: tuple[Segment, ...] = ()
+    sample_indices: Shaped[np.ndarray, "n"]
+    futures: Float[np.ndarray, "n H J 3"]
+    steps_run: int
+    stopped_by: StoppedBy
+    segments: tuple[tuple[Segment, ...], ...] = ()
 
 
 @runtime_checkable
-class Trajectory(Protocol):
-    """The state of one sample on its way, a row of a batch; how it advances is its own affair."""
+class Trajectory(Rows, Protocol):
+    """Samples of one request on their way; how they advance is their own affair."""
 
     @property
-    def request_id(self) -> int:
-        """The request that it belongs to."""
+    def steps_behind(self) -> int:
+        """How many steps they have run; after one there are futures to show."""
+
+    @property
+    def context(self) -> Context:
+        """What the graphs know of them."""
+
+    @property
+    def sample_indices(self) -> Shaped[np.ndarray, "n"]:
+        """Which of the request's samples they are."""
+
+    @property
+    def shown(self) -> Float[np.ndarray, "n H J 3"] | None:
+        """Their futures as they stand, where the request asks for previews."""
+
+    def cut(self: SelfT) -> SelfT:
+        """The same samples, which end in their next turn with what they have."""
 
 
 TrajectoryT = TypeVar("TrajectoryT", bound=Trajectory)
@@ -89,10 +135,10 @@ class Progress(Protocol[TrajectoryT]):
     """A way of a request's samples to their futures."""
 
     def start(self, request_id: int, request: Request) -> list[TrajectoryT]:
-        """The trajectories of a request, by sample; a single one where every sample is alike."""
+        """All samples of a request, or a single one where they are all alike; no graph runs."""
 
-    def advance(self, rows: Sequence[TrajectoryT]) -> list[TrajectoryT | Sample]:
-        """The same rows one turn later; those that have arrived are samples.
+    def advance(self, rows: Sequence[TrajectoryT]) -> list[TrajectoryT | Samples]:
+        """The same samples one turn later; those that have arrived, or were cut, are whole.
 
         Raises:
             EngineError: a graph could not run, or gave NaN; the rows may be advanced again.

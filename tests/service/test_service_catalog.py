@@ -1,18 +1,31 @@
 import json
+import os
 import shutil
 from pathlib import Path
 from threading import Event
 
 import pytest
 from in_memory import Service
-from tiny_bundles import FUTURE, HORIZON, OBSERVATION, LastPose, exported, walking, write
+from tiny_bundles import (
+    FUTURE,
+    HORIZON,
+    OBSERVATION,
+    LastPose,
+    exported,
+    walking,
+    write,
+    write_diffusion_bundle,
+)
 
 from models.bundle import read_manifest
 from service.app import create_app
 from service.catalog import Catalog
+from service.engine.engine import Engine
 from service.errors import UnknownModelError
 from service.settings import Settings
+from service.worker import Limits, Worker
 
+CORES = len(os.sched_getaffinity(0))
 BODY = {"poses": walking(), "num_samples": 1}
 
 
@@ -86,6 +99,15 @@ def answer_nan(folder: Path) -> None:
     write(folder, {"decoder": graph})
 
 
+def lean_on_strangers(folder: Path) -> None:
+    class Mean(LastPose):
+        def forward(self, observation):
+            return super().forward(observation) + observation.mean()
+
+    graph = exported(Mean(), "decoder.onnx", inputs=(OBSERVATION,), outputs=(FUTURE,))
+    write(folder, {"decoder": graph})
+
+
 @pytest.mark.parametrize(
     ("damage", "reason"),
     [
@@ -96,6 +118,7 @@ def answer_nan(folder: Path) -> None:
         (make_manifest_a_folder, "still: found no manifest.json"),
         (rename, "name: found 'stiller'"),
         (answer_nan, "still: the decoder gave NaN"),
+        (lean_on_strangers, "still: the golden request gave other futures among other requests"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
@@ -107,6 +130,41 @@ def test_damaged_bundle_is_refused_with_its_reason(copies: Path, damage, reason:
     assert catalog.entries["diffusion"].state == "ready"
     assert catalog.entries["still"].state == "refused"
     assert reason in (catalog.entries["still"].reason or "")
+
+
+def test_unforeseen_error_refuses_its_bundle_and_no_other(
+    copies: Path, caplog: pytest.LogCaptureFixture
+):
+    def breaks_once(engine: Engine) -> Worker:
+        if engine.manifest.name == "diffusion":
+            raise ZeroDivisionError
+        return Worker(engine, limits=Limits(max_requests=9, max_rows=99))
+
+    catalog = Catalog(copies, default_model=None, worker=breaks_once)
+    catalog.load()
+    catalog.stop()
+    assert catalog.entries["diffusion"].state == "refused"
+    assert catalog.entries["diffusion"].reason == "diffusion: an unforeseen error."
+    assert "ZeroDivisionError" in caplog.text
+    assert catalog.entries["still"].state == "ready"
+
+
+def test_golden_digest_is_that_of_the_same_bytes_for_the_same_bundle(copies: Path):
+    shutil.copytree(copies / "diffusion", copies / "other")
+    manifest = copies / "other" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"name":"diffusion"', '"name":"other"'))
+    manifest.write_text(manifest.read_text().replace('"name": "diffusion"', '"name": "other"'))
+    write_diffusion_bundle(copies / "stochastic", eta=1.0)
+    catalogs = [Catalog(copies, default_model=None, rows_per_step=rows) for rows in (64, 3)]
+    digests = []
+    for catalog in catalogs:
+        catalog.load()
+        catalog.stop()
+        digests.append({e.name: e.golden_digest for e in catalog.entries.values()})
+    first, again = digests
+    assert first == again
+    assert first["diffusion"] == first["other"]
+    assert len({first["diffusion"], first["stochastic"], first["still"]}) == 3
 
 
 def test_default_is_the_setting_or_the_file_or_the_first(copies: Path):
@@ -164,6 +222,20 @@ def test_settings_come_from_the_environment(bundles: Path, monkeypatch: pytest.M
     assert app.state.settings.max_samples == 7
     monkeypatch.delenv("POSEFUTURES_BUNDLES")
     assert Settings().bundles.name == "bundles"
+
+
+@pytest.mark.parametrize(
+    ("given", "workers", "threads"),
+    [
+        ({}, CORES, 1),
+        ({"profile": "latency"}, 1, CORES),
+        ({"workers": 5}, 5, 1),
+        ({"profile": "latency", "workers": 3, "threads": 7}, 3, 7),
+    ],
+)
+def test_profile_decides_who_computes_on_the_cores(given, workers: int, threads: int):
+    settings = Settings(**given)
+    assert (settings.num_workers, settings.num_threads) == (workers, threads)
 
 
 def test_bundle_of_a_test_has_the_horizon_it_says(bundles: Path):

@@ -1,6 +1,9 @@
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import onnxruntime as ort
@@ -9,9 +12,10 @@ from tiny_bundles import NUM_STEPS, X_T_SHAPE, walking
 
 from models.bundle import read_manifest
 from models.diffusion import ddim_step
+from service.engine.context import Part, Tensors
 from service.engine.engine import Engine, predict
 from service.engine.runner import Runner
-from service.engine.trajectory import Failure, Request, Result
+from service.engine.trajectory import Failure, Preview, Request, Result
 from service.errors import FieldError, GraphError, NonFiniteError
 
 WALK = walking().astype(np.float32)
@@ -30,7 +34,15 @@ def futures(engine: Engine, request: Request) -> np.ndarray:
     return predict(engine, request).futures
 
 
-def slow_obvious_future(folder: Path, *, seed: int, sample: int, num_steps: int) -> np.ndarray:
+def slow_obvious_future(
+    folder: Path,
+    observation: np.ndarray = WALK,
+    *,
+    seed: int,
+    sample: int,
+    num_steps: int,
+    leg: int = 0,
+) -> np.ndarray:
     """One sample, one graph call after another, straight from the files."""
     manifest = read_manifest(folder)
     graph = {
@@ -40,9 +52,10 @@ def slow_obvious_future(folder: Path, *, seed: int, sample: int, num_steps: int)
     assert manifest.schedule is not None
     alpha_bar = [*manifest.schedule.alpha_bar]
     variance = [np.array(v)[:, None] for v in manifest.schedule.variance]
-    (context,) = graph["encoder"].run(None, {"observation": WALK[None]})
+    (context,) = graph["encoder"].run(None, {"observation": observation[None]})
+    first = leg * (NUM_STEPS + 1)
     draws = [
-        np.random.Generator(np.random.Philox(key=[seed, sample], counter=[0, 0, 0, k]))
+        np.random.Generator(np.random.Philox(key=[seed, sample], counter=[0, 0, 0, first + k]))
         .standard_normal(X_T_SHAPE, dtype=np.float32)
         for k in range(num_steps + 1)
     ]  # fmt: skip
@@ -63,8 +76,27 @@ def slow_obvious_future(folder: Path, *, seed: int, sample: int, num_steps: int)
                 noise=draws[k + 1],
             )
         )
-    feed = {"x0": x0[None], "context": context, "observation": WALK[None]}
+    feed = {"x0": x0[None], "context": context, "observation": observation[None]}
     return graph["decoder"].run(None, feed)[0][0]
+
+
+def run_by_threads(
+    engine: Engine, requests: Sequence[Request], *, threads: int
+) -> list[list[Result | Failure | Preview]]:
+    """What became of each request."""
+    events: dict[int, list[Result | Failure | Preview]] = {engine.add(r): [] for r in requests}
+
+    def drive() -> None:
+        while engine.num_requests:
+            for event in engine.turn(shares=threads).events:
+                events[event.request_id].append(event)
+
+    drivers = [Thread(target=drive) for _ in range(threads)]
+    for driver in drivers:
+        driver.start()
+    for driver in drivers:
+        driver.join()
+    return list(events.values())
 
 
 @pytest.mark.parametrize("num_steps", [1, 4, NUM_STEPS])
@@ -101,13 +133,142 @@ def test_result_does_not_depend_on_strangers(stochastic_bundle: Path, rows_per_s
     mine = engine.add(request(3, num_samples=9, num_steps=6))
     for seed in range(4):
         engine.add(request(seed, num_samples=seed + 1, num_steps=seed + 1))
-    ended: list[Result | Failure] = []
+    ended: list[Result | Failure | Preview] = []
     while engine.num_requests:
         ended += engine.step()
     (result,) = [end for end in ended if end.request_id == mine]
     assert isinstance(result, Result)
     assert len(ended) == 6
     assert result.futures.tobytes() == alone.tobytes()
+
+
+@pytest.mark.parametrize("rows_per_step", [3, 64])
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_result_does_not_depend_on_how_many_threads_share_the_work(
+    stochastic_bundle: Path, threads: int, rows_per_step: int
+):
+    requests = [
+        request(seed, num_samples=1 + 4 * seed, num_steps=1 + 2 * seed, horizon=50 * seed + 1)
+        for seed in range(5)
+    ]
+    alone = [futures(engine_of(stochastic_bundle), some) for some in requests]
+    engine = engine_of(stochastic_bundle, rows_per_step=rows_per_step)
+    for expected, events in zip(
+        alone, run_by_threads(engine, requests, threads=threads), strict=True
+    ):
+        (result,) = events
+        assert isinstance(result, Result)
+        assert result.futures.tobytes() == expected.tobytes()
+
+
+class CountingRunner(Runner):
+    """Counts the rows that each graph has run."""
+
+    rows: Counter[str]
+
+    def run(self, role: str, tensors: Tensors, parts: Sequence[Part]) -> Tensors:
+        self.rows[role] += sum(count for _, count in parts)
+        return super().run(role, tensors, parts)
+
+
+def test_observation_is_encoded_once_whoever_runs_its_rows(bundles: Path):
+    folder = bundles / "diffusion"
+    runner = CountingRunner(read_manifest(folder), folder)
+    runner.rows = Counter()
+    requests = [request(seed, num_samples=20) for seed in range(10)]
+    run_by_threads(Engine(runner, rows_per_step=8), requests, threads=4)
+    assert runner.rows == {"encoder": 10, "denoiser": 10 * 20 * NUM_STEPS, "decoder": 10 * 20}
+
+
+@pytest.mark.parametrize("bundle", ["diffusion", "stochastic"])
+def test_longer_horizon_enters_the_last_frames_again(
+    bundles: Path, stochastic_bundle: Path, bundle: str
+):
+    folder = stochastic_bundle if bundle == "stochastic" else bundles / bundle
+    result = predict(engine_of(folder, rows_per_step=2), request(7, num_steps=3, horizon=130))
+    assert result.futures.shape == (3, 130, 21, 3)
+    assert (result.steps_run, result.steps_of, result.stopped_by) == (9, 30, "num_steps")
+    for sample, future in enumerate(result.futures):
+        frames = WALK
+        for leg in range(3):
+            seen = frames[-len(WALK) :]
+            made = slow_obvious_future(folder, seen, seed=7, sample=sample, num_steps=3, leg=leg)
+            frames = np.concatenate([frames, made])
+        np.testing.assert_allclose(future, frames[len(WALK) :][:130], atol=2e-6)
+
+
+def test_longer_horizon_continues_the_shorter_one(bundles: Path):
+    engine = engine_of(bundles / "diffusion")
+    short, plain, long = (futures(engine, request(horizon=h)) for h in (20, None, 100))
+    assert short.tobytes() == plain[:, :20].tobytes()
+    assert plain.tobytes() == long[:, :60].tobytes()
+
+
+def test_single_future_of_all_samples_is_rolled_out(bundles: Path):
+    result = predict(engine_of(bundles / "still"), request(num_samples=4, horizon=150))
+    assert (result.steps_run, result.steps_of) == (3, 3)
+    np.testing.assert_array_equal(result.futures, np.broadcast_to(WALK[-1], (4, 150, 21, 3)))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_previews_are_what_fewer_steps_would_give_and_change_no_answer(
+    stochastic_bundle: Path, threads: int
+):
+    some = request(5, num_samples=20, num_steps=6)
+    engine = engine_of(stochastic_bundle, rows_per_step=7)
+    strangers = [request(seed, num_samples=5) for seed in range(3)]
+    asked = replace(some, previews=True)
+    events, *_ = run_by_threads(engine, [asked, *strangers], threads=threads)
+    *previews, result = sorted(events, key=lambda event: getattr(event, "steps_run", 0))
+    assert isinstance(result, Result)
+    assert result.futures.tobytes() == futures(engine, some).tobytes()
+    assert len(previews) == 5
+    for step, preview in enumerate(previews, 1):
+        assert isinstance(preview, Preview)
+        assert (preview.steps_run, preview.steps_of) == (step, NUM_STEPS)
+        fewer = futures(engine, replace(some, num_steps=step))
+        assert preview.futures.tobytes() == fewer.tobytes()
+
+
+def test_previews_of_a_longer_horizon_show_what_there_is(bundles: Path):
+    engine = engine_of(bundles / "diffusion")
+    (events,) = run_by_threads(
+        engine, [request(num_steps=2, horizon=100, previews=True)], threads=1
+    )
+    assert [event.futures.shape[1] for event in events] == [60, 60, 100, 100]  # type: ignore[union-attr]
+
+
+def settled_at(steps: np.ndarray, tolerance_m: float) -> int:
+    """The first step, from the second on, that moved one sample's future (K, H, J, 3) by less."""
+    moved_m = np.linalg.norm(np.diff(steps, axis=0), axis=-1).max(axis=(1, 2))  # (K - 1,)
+    near = np.flatnonzero(moved_m < tolerance_m)
+    return 2 + int(near[0]) if len(near) else len(steps)
+
+
+@pytest.mark.parametrize("tolerance_m", [1e-9, 0.2, 0.5, 99.0])
+def test_sample_stops_once_a_step_moves_it_by_less_than_the_tolerance(
+    bundles: Path, tolerance_m: float
+):
+    engine = engine_of(bundles / "diffusion", rows_per_step=9)
+    by_step = [futures(engine, request(num_samples=30, num_steps=k + 1)) for k in range(NUM_STEPS)]
+    samples = np.array(by_step).swapaxes(0, 1)  # (S, K, H, J, 3)
+    stops = [settled_at(steps, tolerance_m) for steps in samples]
+    result = predict(engine, request(num_samples=30, tolerance_m=tolerance_m))
+    assert result.steps_run == max(stops)
+    assert result.stopped_by == ("tolerance" if min(stops) < NUM_STEPS else "end")
+    for future, steps, stop in zip(result.futures, samples, stops, strict=True):
+        assert future.tobytes() == steps[stop - 1].tobytes()
+
+
+def test_previews_count_samples_that_have_settled(bundles: Path):
+    engine = engine_of(bundles / "diffusion")
+    some = request(num_samples=30, tolerance_m=0.5, previews=True)
+    (events,) = run_by_threads(engine, [some], threads=1)
+    *previews, result = events
+    assert isinstance(result, Result)
+    assert [p.steps_run for p in previews] == list(range(1, result.steps_run))  # type: ignore[union-attr]
+    assert result.stopped_by == "tolerance"
+    assert result.futures.tobytes() == futures(engine, replace(some, previews=False)).tobytes()
 
 
 def test_a_step_runs_no_more_rows_than_allowed_and_all_samples_advance_together(bundles: Path):
@@ -152,7 +313,7 @@ def test_nan_fails_its_own_request_and_no_other(bundles: Path):
     engine = engine_of(bundles / "diffusion")
     good = [engine.add(request(1)), engine.add(request(2))]
     bad = engine.add(Request(observation=TOO_FAST, num_samples=2))
-    ended: list[Result | Failure] = []
+    ended: list[Result | Failure | Preview] = []
     while engine.num_requests:
         ended += engine.step()
     assert sorted(end.request_id for end in ended if isinstance(end, Result)) == good
@@ -177,6 +338,8 @@ def test_cancelled_request_frees_its_rows(bundles: Path):
         (request(num_samples=0), "num_samples: found 0"),
         (request(num_steps=0), "num_steps: found 0"),
         (request(num_steps=11), "num_steps: found 11; diffusion runs 1 to 10"),
+        (request(horizon=0), "horizon_s: found 0 s; diffusion makes a frame or more"),
+        (request(tolerance_m=0.0), "tolerance_m: found 0 m; diffusion takes more than 0"),
     ],
 )
 def test_request_that_does_not_fit_is_refused(bundles: Path, bad: Request, message: str):

@@ -143,14 +143,12 @@ def test_action_lasts_to_the_horizon_where_the_body_never_rests(actions_bundle: 
     assert {segments[0].end for segments in result.segments} == {HORIZON}
 
 
-def test_label_may_have_a_shortest_length_of_its_own(actions_bundle: Path):
-    manifest = read_manifest(actions_bundle)
-    assert manifest.actions is not None
-    actions = manifest.actions.model_copy(update={"shortest": {LABELS[1]: 21}})
-    runner = Runner(manifest.model_copy(update={"actions": actions}), actions_bundle)
-    result = predict(Engine(runner), request(0, 1, 0, stop_threshold_m=99.0))
-    for segments in result.segments:
-        assert [segment.end - segment.start for segment in segments] == [MIN_FRAMES, 21, MIN_FRAMES]
+def test_decoder_may_say_before_when_rest_is_no_end(tmp_path: Path):
+    engine = engine_of(write_actions_bundle(tmp_path / "later", earliest_end=21.7))
+    result = predict(engine, request(0, 1, stop_threshold_m=99.0))
+    assert [segment.end for segment in result.segments[0]] == [21, 42]
+    result = predict(engine, request(0, stop_threshold_m=99.0, max_frames=15))
+    assert result.futures.shape[1] == 15
 
 
 def test_lenient_threshold_ends_an_action_at_its_shortest(actions_bundle: Path):
