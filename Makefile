@@ -2,17 +2,18 @@
 # make test         run every check and every test
 # make lint         run the checks alone
 # make format       rewrite the code as `make lint` wants it
-# make benchmarks   run tests/benchmarks
+# make bench        measure the server and write docs/benchmark.md; BENCH=--quick only prints
 # make clean        remove caches and build outputs; keeps .venv, runs and stores
 
 PYTHON ?= python3
 PORT ?= 8000
+BENCH ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: serve test lint format benchmarks clean
+.PHONY: serve test lint format bench clean
 
 serve: $(VENV)/.core
 	@$(BIN)/posefutures serve --port $(PORT)
@@ -30,8 +31,8 @@ format: $(VENV)/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-benchmarks: $(VENV)/.dev
-	@set -e; for file in tests/benchmarks/[!_]*.py; do echo "$$file"; $(BIN)/python "$$file"; done
+bench: $(VENV)/.dev
+	@PYTHONPATH=tests $(BIN)/python -m benchmarks $(BENCH)
 
 clean:
 	rm -rf build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,11 +1,12 @@
 """The command line ``posefutures``: serve, predict, models, actions."""
 
-import secrets
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
 import typer
@@ -19,17 +20,17 @@ from models.motion.formats.errors import FormatError
 from models.motion.formats.files import read_motion
 from models.motion.kinematics import inverse_kinematics
 from models.motion.motion import Motion
-from service.actions import action_indices, max_frames
+from service import server
 from service.app import create_app
-from service.axes import Axes
 from service.catalog import Catalog
-from service.engine import engine
-from service.engine.trajectory import Request, Segment
+from service.client import AsyncClient
 from service.errors import FieldError, ServiceError
-from service.futures import caller_futures, caller_segments
-from service.observation import frames_needed, observe
+from service.exchange import ClientError
+from service.messages import ActionsOptions, ActionsPrediction, Prediction, PredictOptions, Preview
 from service.schemas import MAX_SEED, MAX_STOP_THRESHOLD_M
 from service.settings import Settings
+
+SENT_S = 10.0  # of a motion, up to now: more than any bundle looks at
 
 app = typer.Typer(
     help="N plausible futures of a person's 3D motion.",
@@ -54,19 +55,14 @@ def serve(
     """Serve the bundles over HTTP; settings are POSEFUTURES_* variables."""
     with _one_line_errors():
         settings = Settings()
-        uvicorn.run(
-            create_app(settings),
-            host=host or settings.host,
-            port=port or settings.port,
-            timeout_graceful_shutdown=10,
-        )
+        server.serve(settings, host=host or settings.host, port=port or settings.port)
 
 
 @app.command()
 def models() -> None:
     """List the bundles."""
     with _one_line_errors():
-        catalog = _catalog(Settings())
+        catalog = _catalog()
         defaults = [catalog.default(with_actions=kind) for kind in (False, True)]
         for name, entry in catalog.entries.items():
             mark = "*" if entry in defaults else " "
@@ -81,7 +77,7 @@ def models() -> None:
 def actions() -> None:
     """List the actions that each bundle performs."""
     with _one_line_errors():
-        for name, spec in _catalog(Settings()).performers().items():
+        for name, spec in _catalog().performers().items():
             typer.echo(name)
             for label in spec.labels:
                 typer.echo(f"  {label}  {spec.examples.get(label, '')}".rstrip())
@@ -92,6 +88,16 @@ def predict(
     file: Annotated[Path, typer.Argument(help="a motion: .bvh, .amc beside its .asf, or .npz")],
     num_samples: Annotated[int, typer.Option(min=1, help="how many futures")] = 10,
     num_steps: Annotated[int | None, typer.Option(min=1, help="stop early")] = None,
+    deadline_ms: Annotated[
+        float | None, typer.Option(help="answer by then with what is ready")
+    ] = None,
+    tolerance_m: Annotated[
+        float | None, typer.Option(help="stop a future that a step moves by less")
+    ] = None,
+    horizon_s: Annotated[float | None, typer.Option(help="seconds to predict")] = None,
+    num_modes: Annotated[
+        int | None, typer.Option(min=1, help="tell so many that stand for all")
+    ] = None,
     model: Annotated[str | None, typer.Option(help="a bundle's name")] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=MAX_SEED)] = None,
     out: Annotated[Path, typer.Option(help="folder to write into")] = Path(),
@@ -105,76 +111,152 @@ def predict(
     max_seconds_per_action: Annotated[
         float | None, typer.Option(help="when an action is cut off")
     ] = None,
+    url: Annotated[
+        str | None,
+        typer.Option(help="a server, such as http://127.0.0.1:8000; one of its own else"),
+    ] = None,
+    stream: Annotated[bool, typer.Option(help="tell of each step")] = False,
 ) -> None:
     """Write N futures of the motion in a file, in its own skeleton and frame rate."""
     with _one_line_errors():
         motion = read_motion(file)
-        catalog = _catalog(Settings())
-        labels = [] if actions is None else [label.strip() for label in actions.split(",")]
-        bundle = catalog.engine(catalog.chosen(model, with_actions=actions is not None))
-        manifest = bundle.manifest
-        seen = _until(motion, at, num_frames=frames_needed(manifest, motion.fps))
-        seed = secrets.randbelow(MAX_SEED + 1) if seed is None else seed
-        observation = observe(
-            seen.positions.astype(np.float64),
-            skeleton=seen.skeleton,
-            order=tuple(range(seen.skeleton.num_joints)),
-            axes=Axes(),
-            fps=seen.fps,
-            manifest=manifest,
-        )
-        request = Request(
-            observation=observation.positions,
-            num_samples=num_samples,
+        seen = _until(motion, at)
+        labels = None if actions is None else [label.strip() for label in actions.split(",")]
+        options = _options(
+            performs=labels is not None,
             num_steps=num_steps,
+            deadline_ms=deadline_ms,
+            tolerance_m=tolerance_m,
+            horizon_s=horizon_s,
+            num_modes=num_modes,
+            stop_threshold=stop_threshold,
+            max_seconds_per_action=max_seconds_per_action,
+            stream=stream or None,
+            num_samples=num_samples,
+            model=model,
             seed=seed,
-            actions=action_indices(labels, manifest),
-            stop_threshold_m=stop_threshold,
-            max_frames=max_frames(max_seconds_per_action, manifest),
         )
-        result = engine.predict(bundle, request)
-        futures = caller_futures(
-            result.futures,
-            observation,
-            manifest=manifest,
-            bone_lengths="observed",
-            segments=result.segments,
-        )
-        segments = caller_segments(result.segments, manifest=manifest, fps=seen.fps)
+        options.pop("stream", None)
+        options |= {
+            "fps": motion.fps,
+            "skeleton": {
+                "joints": list(motion.skeleton.joints),
+                "parents": list(motion.skeleton.parents),
+            },
+        }
+        answer = asyncio.run(_answered(seen, labels, options, url=url, stream=stream))
         out.mkdir(parents=True, exist_ok=True)
-        for warning in observation.warnings:
+        for warning in answer.warnings:
             typer.echo(f"warning: {warning}", err=True)
         if output_format is OutputFormat.BVH:
-            ends = [parts[-1].end for parts in segments] or [futures.shape[1]] * len(futures)
-            _write_bvh(
-                out, motion, [future[:end] for future, end in zip(futures, ends, strict=True)]
-            )
+            _write_bvh(out, motion, list(answer.futures))
         else:
-            _write_npz(out, motion, futures, **_performed(labels, segments))
+            _write_npz(out, motion, answer)
+        if isinstance(answer, Prediction):
+            _tell(answer)
         typer.echo(
-            f"{num_samples} futures of {file.name} by {manifest.name}, seed {seed}, in {out}"
+            f"{num_samples} futures of {file.name} by {answer.model}, seed {answer.seed}, in {out}"
         )
 
 
-def _catalog(settings: Settings) -> Catalog:
-    return Catalog(settings.bundles, default_model=settings.default_model, threads=settings.threads)
+def _tell(answer: Prediction) -> None:
+    """What of an answer is no file: where it stopped early, and which futures stand for all."""
+    steps = answer.steps
+    if steps.stopped_by != "end":
+        typer.echo(f"{steps.run} of {steps.of} steps: stopped by {steps.stopped_by}")
+    for mode in answer.modes:
+        typer.echo(f"{100.0 * mode.probability:.0f} % like future {mode.sample}")
 
 
-def _until(motion: Motion, at: float | None, *, num_frames: int) -> Motion:
-    """The frames up to a second of the motion."""
-    if at is None:
-        return motion
-    end = round(at * motion.fps) + 1
-    if not num_frames <= end <= motion.num_frames:
+def _options(*, performs: bool, **asked: Any) -> dict[str, Any]:
+    """What is asked for, of the options that such a request has."""
+    options = {name: value for name, value in asked.items() if value is not None}
+    if "num_modes" in options:
+        options["returned"] = ["futures", "modes"]
+    known = (
+        ActionsOptions.__annotations__
+        if performs
+        else PredictOptions.__annotations__ | {"stream": bool}
+    )
+    for name in sorted(options.keys() - known):
+        raise FieldError(
+            pointer=f"/{name}",
+            found=f"{options[name]}",
+            expected=f"it is for a request with{'out' if performs else ''} --actions",
+        )
+    return options
+
+
+def _catalog() -> Catalog:
+    catalog: Catalog = create_app(Settings()).state.catalog
+    return catalog
+
+
+async def _answered(
+    seen: Motion,
+    labels: list[str] | None,
+    options: dict[str, Any],
+    *,
+    url: str | None,
+    stream: bool,
+) -> Prediction | ActionsPrediction:
+    settings = Settings()
+    keys = [key.get_secret_value() for key in settings.api_keys]
+    async with (
+        _server(url, settings) as address,
+        AsyncClient(address, api_key=keys[0] if keys else None) as client,
+    ):
+        if labels is not None:
+            return await client.predict_actions(seen.positions, labels, **options)
+        if not stream:
+            return await client.predict(seen.positions, **options)
+        return await _streamed(client.stream(seen.positions, **options), seen.positions[-1:])
+
+
+async def _streamed(
+    events: AsyncIterator[Preview | Prediction], before: Float[np.ndarray, "*N H J 3"]
+) -> Prediction:
+    """The prediction, after a line on stderr for each step before the last."""
+    async for event in events:
+        if isinstance(event, Prediction):
+            prediction = event
+        else:
+            moved = np.linalg.norm(event.futures - before, axis=-1).max()
+            typer.echo(f"step {event.run} of {event.of}: {moved:.3f} m moved", err=True)
+        before = event.futures
+    return prediction
+
+
+@asynccontextmanager
+async def _server(url: str | None, settings: Settings) -> AsyncIterator[str]:
+    """The address of a server: the one at ``url``, or one that lives as long as the context."""
+    if url is not None:
+        yield url
+        return
+    application = create_app(settings)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        host, port = listener.getsockname()
+        running = uvicorn.Server(uvicorn.Config(application, log_config=None))
+        serving = asyncio.create_task(running.serve([listener]))
+        try:
+            while application.state.catalog.state == "loading" and not serving.done():
+                await asyncio.sleep(0.01)
+            yield f"http://{host}:{port}"
+        finally:
+            running.should_exit = True
+            await serving
+
+
+def _until(motion: Motion, at: float | None) -> Motion:
+    """The frames up to a second of the motion, and of those the last ones."""
+    end = motion.num_frames if at is None else round(at * motion.fps) + 1
+    if not 1 <= end <= motion.num_frames:
         raise FieldError(
             pointer="/at",
             found=f"{at:g} s",
-            expected=(
-                f"{motion.name} can be continued from {(num_frames - 1) / motion.fps:.2f} s "
-                f"to {motion.duration:.2f} s"
-            ),
+            expected=f"{motion.name} lasts from 0 s to {motion.duration:.2f} s",
         )
-    return motion[:end]
+    return motion[max(0, end - round(SENT_S * motion.fps)) : end]
 
 
 def _write_bvh(out: Path, motion: Motion, futures: Sequence[Float[np.ndarray, "_ J 3"]]) -> None:
@@ -197,36 +279,44 @@ def _write_bvh(out: Path, motion: Motion, futures: Sequence[Float[np.ndarray, "_
         write_bvh(out / f"{name}.bvh", sample)
 
 
-def _performed(
-    labels: Sequence[str], segments: Sequence[Sequence[Segment]]
-) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Labels (A,), and for each future and action the end in frames, and whether it stopped."""
-    if not segments:
-        return {}
-    ends = np.array([[part.end for part in parts] for parts in segments])
-    return {
-        "lengths": ends[:, -1],
-        "actions": np.array(labels),
-        "segment_ends": ends,
-        "stopped": np.array([[part.stopped for part in parts] for parts in segments]),
-    }
-
-
-def _write_npz(
-    out: Path,
-    motion: Motion,
-    futures: Float[np.ndarray, "N H J 3"],
-    **performed: Shaped[np.ndarray, "..."],
-) -> None:
+def _write_npz(out: Path, motion: Motion, answer: Prediction | ActionsPrediction) -> None:
+    """One array of all futures, shorter ones repeating their last frame, beside what they are."""
+    longest = max(len(future) for future in answer.futures)
+    futures = [
+        np.pad(future, ((0, longest - len(future)), (0, 0), (0, 0)), mode="edge")
+        for future in answer.futures
+    ]
+    told = _performed(answer) if isinstance(answer, ActionsPrediction) else _modes(answer)
     np.savez(
         out / f"{motion.name}-futures.npz",
         allow_pickle=False,
-        futures=futures.astype(np.float32),
+        futures=np.array(futures, dtype=np.float32),
         joints=np.array(motion.skeleton.joints),
         parents=np.array(motion.skeleton.parents),
         fps=np.float64(motion.fps),
-        **performed,
+        **told,
     )
+
+
+def _performed(answer: ActionsPrediction) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Labels (A,), and for each future and action the end in frames, and whether it stopped."""
+    ends = np.array([[part.end for part in parts] for parts in answer.segments])
+    return {
+        "lengths": ends[:, -1],
+        "actions": np.array([part.action for part in answer.segments[0]]),
+        "segment_ends": ends,
+        "stopped": np.array([[part.stopped for part in parts] for parts in answer.segments]),
+    }
+
+
+def _modes(answer: Prediction) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Of each mode the future that stands for it (M,), and its probability (M,)."""
+    if not answer.modes:
+        return {}
+    return {
+        "modes": np.array([mode.sample for mode in answer.modes]),
+        "probabilities": np.array([mode.probability for mode in answer.modes]),
+    }
 
 
 @contextmanager
@@ -240,7 +330,7 @@ def _one_line_errors() -> Iterator[None]:
         _fail(f"POSEFUTURES_{field}: found {first['input']!r}; {first['msg']}.")
     except OSError as error:
         _fail(f"{error.filename or 'the file'}: {error.strerror or error}.")
-    except (ServiceError, BundleError, FormatError) as error:
+    except (ServiceError, ClientError, BundleError, FormatError) as error:
         _fail(str(error))
 
 

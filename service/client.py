@@ -1,102 +1,125 @@
-"""A client of the service, for people who hold arrays.
+"""Clients of the service, for people who hold arrays: `Client` blocks, `AsyncClient` is awaited.
 
-ClientError                 the service did not answer with a prediction
-├── ProblemError            it said why: type, pointer, found, expected
-│   ├── BadRequestError     the request is at fault (4xx)
-│   └── ServerFailedError   the server is at fault (5xx)
-└── ConnectionFailedError   there was no answer
+The errors that they raise are a tree, drawn in `service.exchange`.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import AsyncGenerator, Iterator, Sequence
 from types import TracebackType
-from typing import Any
+from typing import Any, Unpack
 
 import httpx
 import numpy as np
-import orjson
 from jaxtyping import Float
 
+from service import messages
+from service.exchange import Exchange, each_now, key, now
+from service.messages import (
+    ActionsOptions,
+    ActionsPrediction,
+    Prediction,
+    PredictOptions,
+    Preview,
+)
 
-class ClientError(Exception):
-    """The service did not answer with a prediction."""
-
-
-class ConnectionFailedError(ClientError):
-    """There was no answer."""
-
-
-class ProblemError(ClientError):
-    """The service said what is wrong; ``problem`` is its problem+json."""
-
-    def __init__(self, status: int, problem: dict[str, Any]) -> None:
-        super().__init__(problem.get("detail") or f"HTTP {status}")
-        self.status = status
-        self.problem = problem
-
-    @property
-    def slug(self) -> str:
-        """The stable name of the problem, such as ``unknown-skeleton``."""
-        return str(self.problem.get("type", "")).rsplit("/", 1)[-1]
+URL = "http://127.0.0.1:8000"
 
 
-class BadRequestError(ProblemError):
-    """The request is at fault."""
+class AsyncClient:
+    """Asks one server; an async context manager that closes its connections.
 
-
-class ServerFailedError(ProblemError):
-    """The server is at fault."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Prediction:
-    """Futures in the caller's world, skeleton, axes, units and rate."""
-
-    futures: Float[np.ndarray, "N H J 3"]
-    joints: tuple[str, ...]
-    fps: float
-    seed: int
-    model: str
-    warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ActionSegment:
-    """The frames ``start`` to before ``end`` of a future, in which one action is performed.
-
-    ``stopped`` is false where the action was cut off.
+    A request that the server is too busy for, or whose connection is lost, is sent again with the
+    same seed, so that its answer is the same: at most ``attempts`` times, when the server says,
+    and not after ``timeout_s`` or after its own deadline.
     """
-
-    action: str
-    start: int
-    end: int
-    stopped: bool
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class ActionsPrediction:
-    """Futures as ``Prediction`` has them, each as long as its actions took."""
-
-    futures: tuple[Float[np.ndarray, "_ J 3"], ...]
-    segments: tuple[tuple[ActionSegment, ...], ...]
-    joints: tuple[str, ...]
-    fps: float
-    seed: int
-    model: str
-    warnings: tuple[str, ...]
-
-
-class Client:
-    """Asks one server; a context manager that closes its connections."""
 
     def __init__(
         self,
-        base_url: str = "http://127.0.0.1:8000",
+        base_url: str = URL,
         *,
         timeout_s: float = 60.0,
+        attempts: int = 5,
+        api_key: str | None = None,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        http = httpx.AsyncClient(base_url=base_url, headers=key(api_key), transport=transport)
+        self._exchange = Exchange(http, timeout_s=timeout_s, attempts=attempts)
+
+    async def __aenter__(self) -> "AsyncClient":
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.aclose()
+
+    async def aclose(self) -> None:
+        """Close the connections."""
+        await self._exchange.close()
+
+    async def predict(
+        self, poses: Float[np.ndarray, "T J 3"], **options: Unpack[PredictOptions]
+    ) -> Prediction:
+        """Futures of the poses; a joint that is NaN was not seen.
+
+        Raises:
+            ClientError: one of its subclasses says why there is no prediction.
+        """
+        return await self._exchange.answer(messages.predict(poses, options))
+
+    async def predict_actions(
+        self,
+        poses: Float[np.ndarray, "T J 3"],
+        actions: Sequence[str],
+        **options: Unpack[ActionsOptions],
+    ) -> ActionsPrediction:
+        """Futures of the poses, in which the person performs the actions one after the other.
+
+        Raises:
+            ClientError: one of its subclasses says why there is no prediction.
+        """
+        return await self._exchange.answer(messages.predict_actions(poses, actions, options))
+
+    def stream(
+        self, poses: Float[np.ndarray, "T J 3"], **options: Unpack[PredictOptions]
+    ) -> AsyncGenerator[Preview | Prediction, None]:
+        """Previews as the steps run, and then what ``predict`` gives; closing it frees the rows.
+
+        Raises:
+            CutStreamError: the stream broke off; what came before is not the prediction.
+            ClientError: one of its subclasses says why there is no prediction.
+        """
+        return self._exchange.events(messages.predict(poses, options))
+
+    async def cancel(self, request_id: str) -> bool:
+        """Free the rows of a request; false where nothing of this ``request_id`` is under way."""
+        return await self._exchange.cancelled(request_id)
+
+    async def models(self) -> dict[str, Any]:
+        """What ``GET /models`` says."""
+        return await self._exchange.answer(messages.got("/models"))
+
+    async def actions(self) -> dict[str, Any]:
+        """What ``GET /actions`` says."""
+        return await self._exchange.answer(messages.got("/actions"))
+
+
+class Client:
+    """`AsyncClient` for code that waits; a context manager that closes its connections."""
+
+    def __init__(
+        self,
+        base_url: str = URL,
+        *,
+        timeout_s: float = 60.0,
+        attempts: int = 5,
+        api_key: str | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        self._http = httpx.Client(base_url=base_url, timeout=timeout_s, transport=transport)
+        http = httpx.Client(base_url=base_url, headers=key(api_key), transport=transport)
+        self._exchange = Exchange(http, timeout_s=timeout_s, attempts=attempts)
 
     def __enter__(self) -> "Client":
         return self
@@ -111,94 +134,37 @@ class Client:
 
     def close(self) -> None:
         """Close the connections."""
-        self._http.close()
+        now(self._exchange.close())
 
-    def predict(self, poses: Float[np.ndarray, "T J 3"], **options: Any) -> Prediction:
-        """Futures of the poses; a joint that is NaN was not seen.
-
-        Options are the other fields of ``POST /predict``: skeleton, axes, fps, num_samples,
-        num_steps, seed, model, bone_lengths.
-
-        Raises:
-            BadRequestError: the request is at fault.
-            ServerFailedError: the server is at fault.
-            ConnectionFailedError: there was no answer.
-        """
-        content = self._send("POST", "/predict", {"poses": _frames(poses), **options})
-        return Prediction(
-            futures=np.array(content["futures"], dtype=np.float64), **_envelope(content)
-        )
+    def predict(
+        self, poses: Float[np.ndarray, "T J 3"], **options: Unpack[PredictOptions]
+    ) -> Prediction:
+        """`AsyncClient.predict`."""
+        return now(self._exchange.answer(messages.predict(poses, options)))
 
     def predict_actions(
-        self, poses: Float[np.ndarray, "T J 3"], actions: Sequence[str], **options: Any
+        self,
+        poses: Float[np.ndarray, "T J 3"],
+        actions: Sequence[str],
+        **options: Unpack[ActionsOptions],
     ) -> ActionsPrediction:
-        """Futures of the poses, in which the person performs the actions one after the other.
+        """`AsyncClient.predict_actions`."""
+        return now(self._exchange.answer(messages.predict_actions(poses, actions, options)))
 
-        Options are the other fields of ``POST /predict_actions``: skeleton, axes, fps, num_samples,
-        seed, model, bone_lengths, stop_threshold, max_seconds_per_action.
+    def stream(
+        self, poses: Float[np.ndarray, "T J 3"], **options: Unpack[PredictOptions]
+    ) -> Iterator[Preview | Prediction]:
+        """`AsyncClient.stream`."""
+        return each_now(self._exchange.events(messages.predict(poses, options)))
 
-        Raises:
-            BadRequestError: the request is at fault.
-            ServerFailedError: the server is at fault.
-            ConnectionFailedError: there was no answer.
-        """
-        body = {"poses": _frames(poses), "actions": list(actions), **options}
-        content = self._send("POST", "/predict_actions", body)
-        futures = content["futures"]
-        return ActionsPrediction(
-            futures=tuple(np.array(future["poses"], dtype=np.float64) for future in futures),
-            segments=tuple(
-                tuple(ActionSegment(**segment) for segment in future["segments"])
-                for future in futures
-            ),
-            **_envelope(content),
-        )
+    def cancel(self, request_id: str) -> bool:
+        """`AsyncClient.cancel`."""
+        return now(self._exchange.cancelled(request_id))
 
     def models(self) -> dict[str, Any]:
         """What ``GET /models`` says."""
-        return self._send("GET", "/models")
+        return now(self._exchange.answer(messages.got("/models")))
 
     def actions(self) -> dict[str, Any]:
         """What ``GET /actions`` says."""
-        return self._send("GET", "/actions")
-
-    def _send(
-        self, method: str, path: str, content: dict[str, Any] | None = None
-    ) -> dict[str, Any]:
-        body = None if content is None else orjson.dumps(content)
-        headers = {"content-type": "application/json"} if body else {}
-        try:
-            response = self._http.request(method, path, content=body, headers=headers)
-        except httpx.TransportError as error:
-            raise ConnectionFailedError(
-                f"{self._http.base_url}: found no server that answers ({error}); "
-                "start one with `posefutures serve`."
-            ) from error
-        if response.is_error:
-            kind = ServerFailedError if response.status_code >= 500 else BadRequestError
-            raise kind(response.status_code, _problem(response))
-        answer: dict[str, Any] = orjson.loads(response.content)
-        return answer
-
-
-def _frames(poses: Float[np.ndarray, "T J 3"]) -> list[list[list[float] | None]]:
-    return [
-        [None if np.isnan(joint).any() else joint.tolist() for joint in frame] for frame in poses
-    ]
-
-
-def _envelope(content: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "joints": tuple(content["joints"]),
-        "fps": content["fps"],
-        "seed": content["seed"],
-        "model": content["model"]["name"],
-        "warnings": tuple(content["warnings"]),
-    }
-
-
-def _problem(response: httpx.Response) -> dict[str, Any]:
-    if response.headers.get("content-type") != "application/problem+json":
-        return {}  # something between us and the service answered
-    problem: dict[str, Any] = orjson.loads(response.content)
-    return problem
+        return now(self._exchange.answer(messages.got("/actions")))

@@ -1,8 +1,11 @@
+import socket
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
 import typer
+import uvicorn
 from tiny_bundles import walking
 from typer.testing import CliRunner, Result
 
@@ -10,7 +13,9 @@ from models.motion.formats.bvh import read_bvh, write_bvh
 from models.motion.kinematics import bone_lengths
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21
+from service.app import create_app
 from service.cli import app
+from service.settings import Settings
 
 
 @pytest.fixture(autouse=True)
@@ -109,6 +114,9 @@ def test_mistakes_about_actions_are_one_line(walk: Path):
         said("--actions", "reach,weve")
     )
     assert "actions[0]: found ''" in said("--actions", "")
+    assert "stream: found True; it is for a request without --actions" in (
+        said("--actions", "wave", "--stream")
+    )
     assert "model: found 'still'; must be one that performs actions" in (
         said("--actions", "wave", "--model", "still")
     )
@@ -116,9 +124,12 @@ def test_mistakes_about_actions_are_one_line(walk: Path):
     assert "max_seconds_per_action: found 9 s" in (
         said("--actions", "wave", "--max-seconds-per-action", "9")
     )
-    assert "stop_threshold: found 0 m" in said("--actions", "wave", "--stop-threshold", "0")
-    assert "stop_threshold: found 0.1 m; diffusion performs no" in said("--stop-threshold", "0.1")
-    assert "max_seconds_per_action: found 1 s" in said("--max-seconds-per-action", "1")
+    assert "stop_threshold: found 0" in said("--actions", "wave", "--stop-threshold", "0")
+    for option in ("--stop-threshold", "--max-seconds-per-action"):
+        assert "found 0.1; it is for a request with --actions" in said(option, "0.1")
+    assert "num_steps: found 3; it is for a request without --actions" in (
+        said("--actions", "wave", "--num-steps", "3")
+    )
 
 
 def test_actions_without_a_bundle_that_performs_them_are_one_line(walk: Path):
@@ -144,6 +155,53 @@ def test_same_seed_writes_the_same_files(walk: Path, tmp_path: Path):
     assert first == second
 
 
+def test_modes_and_a_longer_future_are_written_and_told(walk: Path, tmp_path: Path):
+    result = run("predict", walk, "--format", "npz", "--out", tmp_path, "--num-samples", "12",
+                 "--num-modes", "3", "--horizon-s", "3", "--num-steps", "4")  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "stopped by num_steps" in result.stdout
+    assert result.stdout.count("% like future") == 3
+    with np.load(tmp_path / "walk-futures.npz") as archive:
+        assert archive["futures"].shape == (12, 90, 21, 3)
+        assert archive["probabilities"].sum() == pytest.approx(1.0)
+        assert set(archive["modes"]) <= set(range(12))
+
+
+def test_stream_tells_of_each_step_and_writes_the_same(walk: Path, tmp_path: Path):
+    options = ("--seed", "9", "--num-samples", "1", "--num-steps", "3")
+    plain = run("predict", walk, *options, "--out", tmp_path / "plain")
+    streamed = run("predict", walk, *options, "--out", tmp_path / "streamed", "--stream")
+    assert plain.exit_code == streamed.exit_code == 0, streamed.output
+    steps = [line for line in streamed.stderr.splitlines() if line.startswith("step ")]
+    assert steps
+    assert all(" of 10: " in line and line.endswith(" m moved") for line in steps)
+    first, second = (tmp_path / f"{out}/walk-future-0.bvh" for out in ("plain", "streamed"))
+    np.testing.assert_allclose(read_bvh(first).positions, read_bvh(second).positions, atol=1e-3)
+
+
+def test_a_running_server_is_asked(
+    bundles: Path, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    application = create_app(Settings(bundles=bundles, api_keys="k1,k2"))
+    monkeypatch.setenv("POSEFUTURES_BUNDLES", str(tmp_path / "nowhere"))
+    server = uvicorn.Server(uvicorn.Config(application, log_config=None))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        thread = Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            refused = run("predict", walk, "--url", url, "--out", tmp_path)
+            monkeypatch.setenv("POSEFUTURES_API_KEYS", "k2")
+            options = ("--num-samples", "2", "--deadline-ms", "60000", "--tolerance-m", "1e-6")
+            result = run("predict", walk, "--url", url, "--out", tmp_path, *options)
+        finally:
+            server.should_exit = True
+            thread.join()
+    assert "authorization: found no key" in one_line(refused)
+    assert result.exit_code == 0, result.output
+    assert len(list(tmp_path.glob("walk-future-*.bvh"))) == 2
+
+
 def test_file_cut_in_the_middle_is_one_line(walk: Path):
     text = walk.read_text()
     walk.write_text(text[: len(text) * 2 // 3])
@@ -155,6 +213,9 @@ def test_other_mistakes_are_one_line(walk: Path, tmp_path: Path):
     assert "must be one of diffusion, still" in one_line(run("predict", walk, "--model", "oracle"))
     assert "at: found 9 s" in one_line(run("predict", walk, "--at", "9"))
     assert "num_steps: found 99" in one_line(run("predict", walk, "--num-steps", "99"))
+    assert "found no server that answers" in (
+        one_line(run("predict", walk, "--url", "http://127.0.0.1:1"))
+    )
 
 
 def test_bad_setting_is_one_line(monkeypatch: pytest.MonkeyPatch):
@@ -176,7 +237,8 @@ def test_flags_are_frozen():
         "models": [],
         "actions": [],
         "predict": [
-            "file", "num_samples", "num_steps", "model", "seed", "out", "output_format", "at",
-            "actions", "stop_threshold", "max_seconds_per_action",
+            "file", "num_samples", "num_steps", "deadline_ms", "tolerance_m", "horizon_s",
+            "num_modes", "model", "seed", "out", "output_format", "at",
+            "actions", "stop_threshold", "max_seconds_per_action", "url", "stream",
         ],
     }  # fmt: skip

@@ -1,0 +1,223 @@
+"""What a client asks and what it is told: the fields of a request, and of its answer, as arrays."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from secrets import SystemRandom
+from typing import Any, Generic, Literal, TypedDict, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from service.modes import Mode
+from service.quantiles import Regions
+from service.schemas import MAX_SEED
+
+_T = TypeVar("_T")
+_T_co = TypeVar("_T_co", covariant=True)
+
+
+class Options(TypedDict, total=False):
+    """What any request may say beside its poses, as ``GET /docs`` explains it.
+
+    ``request_id`` is no field: it names the request, so that it can be cancelled.
+    """
+
+    skeleton: str | Mapping[str, Any] | None
+    axes: Mapping[str, str]
+    fps: float | None
+    num_samples: int
+    seed: int | None
+    model: str | None
+    bone_lengths: Literal["observed", "free"]
+    deadline_ms: float | None
+    request_id: str
+
+
+class PredictOptions(Options, total=False):
+    """The options of ``POST /predict``; ``returned`` is its field ``return``."""
+
+    num_steps: int | None
+    tolerance_m: float | None
+    horizon_s: float | None
+    returned: Sequence[Literal["futures", "modes", "quantiles"]]
+    num_modes: int
+    quantile_levels: Sequence[float]
+
+
+class ActionsOptions(Options, total=False):
+    """The options of ``POST /predict_actions``."""
+
+    stop_threshold: float | None
+    max_seconds_per_action: float | None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Steps:
+    """Denoising steps that ran, at most, of those there are, and what stopped them."""
+
+    run: int
+    of: int
+    stopped_by: str
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Preview:
+    """The futures as they are after some of the steps."""
+
+    futures: Float[np.ndarray, "N H J 3"]
+    run: int
+    of: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Answer:
+    """What every answer says beside its futures; ``timing_ms`` of each stage is the server's."""
+
+    id: str
+    joints: tuple[str, ...]
+    fps: float
+    seed: int
+    model: str
+    warnings: tuple[str, ...]
+    timing_ms: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Prediction(Answer):
+    """Futures in the caller's world, skeleton, axes, units and rate.
+
+    There are none where only ``modes`` or ``quantiles`` were to be returned; the radius of the
+    latter is in the caller's units too.
+    """
+
+    futures: Float[np.ndarray, "N H J 3"]
+    modes: tuple[Mode, ...]
+    quantiles: Regions | None
+    steps: Steps
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ActionSegment:
+    """The frames ``start`` to before ``end`` of a future, in which one action is performed.
+
+    ``stopped`` is false where the action was cut off.
+    """
+
+    action: str
+    start: int
+    end: int
+    stopped: bool
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class ActionsPrediction(Answer):
+    """Futures as ``Prediction`` has them, each as long as its actions took."""
+
+    futures: tuple[Float[np.ndarray, "_ J 3"], ...]
+    segments: tuple[tuple[ActionSegment, ...], ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Call(Generic[_T_co]):
+    """What is asked, and how its answer is read."""
+
+    method: str
+    path: str
+    body: dict[str, Any] | None = None
+    request_id: str | None = None
+    read: Callable[[dict[str, Any]], _T_co]
+
+    @property
+    def deadline_s(self) -> float:
+        """Seconds from the first try in which an answer is of use."""
+        return float((self.body or {}).get("deadline_ms") or inf) / 1e3
+
+    def body_after(self, spent_s: float) -> dict[str, Any] | None:
+        """The body of a try so long after the first, with the time that is left."""
+        if self.body is None or self.deadline_s == inf:
+            return self.body
+        return {**self.body, "deadline_ms": 1e3 * (self.deadline_s - spent_s)}
+
+
+def predict(poses: Float[np.ndarray, "T J 3"], options: PredictOptions) -> Call[Prediction]:
+    """Asks for futures of the poses."""
+    return _posted("/predict", {"poses": poses, **options}, _prediction)
+
+
+def predict_actions(
+    poses: Float[np.ndarray, "T J 3"], actions: Sequence[str], options: ActionsOptions
+) -> Call[ActionsPrediction]:
+    """Asks for futures in which actions are performed."""
+    body = {"poses": poses, "actions": list(actions), **options}
+    return _posted("/predict_actions", body, _actions_prediction)
+
+
+def _posted(path: str, fields: dict[str, Any], read: Callable[[dict[str, Any]], _T]) -> Call[_T]:
+    """A call whose seed is drawn here, so that however often it is sent, the answer is one."""
+    body = {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in fields.items()
+    }
+    request_id = body.pop("request_id", None)
+    if "returned" in body:
+        body["return"] = body.pop("returned")
+    if body.get("seed") is None:
+        body["seed"] = SystemRandom().randrange(MAX_SEED + 1)
+    return Call(method="POST", path=path, body=body, request_id=request_id, read=read)
+
+
+def got(path: str) -> Call[dict[str, Any]]:
+    """Asks for what a path says, whatever it is."""
+    return Call(method="GET", path=path, read=dict)
+
+
+def _prediction(content: dict[str, Any]) -> Prediction:
+    none = np.empty((0, content["num_frames"], len(content["joints"]), 3))
+    quantiles = content.get("quantiles")
+    return Prediction(
+        futures=np.array(content.get("futures", none)),
+        modes=tuple(
+            Mode(**mode | {"members": tuple(mode["members"])}) for mode in content.get("modes", ())
+        ),
+        quantiles=quantiles and _regions(**quantiles),
+        steps=Steps(**content["steps"]),
+        **_said(content),
+    )
+
+
+def _regions(levels: Sequence[float], centre: Any, radius: Any, *, calibrated: bool) -> Regions:
+    return Regions(
+        levels=tuple(levels),
+        centre=np.array(centre),
+        radius=np.array(radius),
+        calibrated=calibrated,
+    )
+
+
+def _actions_prediction(content: dict[str, Any]) -> ActionsPrediction:
+    futures = content["futures"]
+    return ActionsPrediction(
+        futures=tuple(np.array(future["poses"]) for future in futures),
+        segments=tuple(
+            tuple(ActionSegment(**segment) for segment in future["segments"]) for future in futures
+        ),
+        **_said(content),
+    )
+
+
+def _said(content: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "id": content["id"],
+        "joints": tuple(content["joints"]),
+        "fps": content["fps"],
+        "seed": content["seed"],
+        "model": content["model"]["name"],
+        "warnings": tuple(content["warnings"]),
+        "timing_ms": content["timing_ms"],
+    }
+
+
+def preview(content: dict[str, Any]) -> Preview:
+    """What a stream says after a step."""
+    return Preview(futures=np.array(content["futures"]), **content["steps"])

@@ -1,0 +1,98 @@
+"""Speed of actions as ratios: the engine against the same network in PyTorch eager."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from benchmarks.rounds import medians
+from tiny_bundles import walking
+from torch import Tensor
+
+from models.bundle import read_manifest
+from models.system import Graph, Recipe
+from service.engine.engine import Engine, predict
+from service.engine.runner import Runner
+from service.engine.trajectory import Request
+from training.cli import load_recipe
+from training.export import unstopped
+
+NUM_SAMPLES = 50
+RECIPE = "models.systems.wat.recipes:mocap"
+FRAMES_PER_STEP = 5
+
+
+def table(bundle: Path, *, rounds: int, threads: int) -> list[tuple[str, float, str]]:
+    """What ran, its milliseconds, and how often it fits into what."""
+    found = medians(
+        {
+            "eager": stepped(load_recipe(RECIPE), frames_per_step=FRAMES_PER_STEP),
+            "longest": engine_on(bundle, num_actions=1, threads=threads, to_the_end=True),
+            "one": engine_on(bundle, num_actions=1, threads=threads),
+            "two": engine_on(bundle, num_actions=2, threads=threads),
+            "four": engine_on(bundle, num_actions=4, threads=threads),
+        },
+        rounds=rounds,
+    )
+    eager, one, name = found["eager"], found["one"], bundle.name
+    return [
+        ("one action in PyTorch eager, step by step to its longest", eager, "1"),
+        (
+            f"{name}, one action to its longest",
+            found["longest"],
+            f"{eager / found['longest']:.1f} x",
+        ),
+        (f"{name}, one action until it stops", one, f"{eager / one:.1f} x"),
+        (f"{name}, 2 actions", found["two"], f"{found['two'] / one:.1f} x one action"),
+        (f"{name}, 4 actions", found["four"], f"{found['four'] / one:.1f} x one action"),
+    ]
+
+
+def stepped(recipe: Recipe, *, frames_per_step: int) -> Callable[[], Tensor]:
+    """One action in PyTorch eager, a step at a time to its longest: the stop is found afterwards.
+
+    So the authors' code does it, at whatever frame the motion then turns out to end.
+    """
+    make_graphs: Callable[..., tuple[Graph, ...]] = recipe.graphs
+    encoder, decoder = make_graphs(recipe.build().eval(), chunk_frames=frames_per_step)
+    seen = torch.from_numpy(walking().astype(np.float32))[None]
+
+    @torch.no_grad()
+    def perform() -> Tensor:
+        tensors = {
+            "observation": seen.expand(NUM_SAMPLES, -1, -1, -1),
+            "action": torch.zeros(NUM_SAMPLES, dtype=torch.int64),
+            "noise": torch.randn(NUM_SAMPLES, *recipe.x_t_shape),
+        }
+        tensors |= outputs(encoder, tensors)
+        frames = []
+        for _ in range(0, recipe.data.horizon, frames_per_step):
+            given = outputs(decoder, tensors)
+            frames.append(given.pop("future"))
+            tensors |= {name.removeprefix("next_"): value for name, value in given.items()}
+        return torch.cat(frames, dim=1)
+
+    return perform
+
+
+def outputs(graph: Graph, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """What a graph's module gives, by name."""
+    values = graph.module(*(tensors[name] for name in graph.inputs))
+    return dict(zip(graph.outputs, values, strict=True))
+
+
+def engine_on(
+    bundle: Path, *, num_actions: int, threads: int, to_the_end: bool = False
+) -> Callable[[], np.ndarray]:
+    """One request of N samples through the service's engine."""
+    manifest = read_manifest(bundle)
+    engine = Engine(
+        Runner(unstopped(manifest) if to_the_end else manifest, bundle, threads=threads)
+    )
+    request = Request(
+        observation=walking().astype(np.float32),
+        num_samples=NUM_SAMPLES,
+        seed=1,
+        actions=(0,) * num_actions,
+    )
+    return lambda: predict(engine, request).futures
