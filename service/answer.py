@@ -1,107 +1,163 @@
-"""The answer to a prediction as JSON bytes, written from arrays without a detour."""
+"""The answer to a prediction as bytes, written from arrays without a detour."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
-import orjson
 from jaxtyping import Float
 
 from models.bundle import Manifest
-from service.engine.trajectory import Result, Segment
-from service.futures import BoneLengths, caller_futures, caller_segments, written
+from service.axes import UNITS_PER_METRE
+from service.engine.trajectory import Preview, Result, Segment
+from service.futures import DECIMALS, BoneLengths, caller_futures, caller_segments, written
+from service.media import encoded
+from service.modes import modes
 from service.observation import Observation
+from service.quantiles import regions
 from service.worker import Timing
 
 
-def json_answer(
-    result: Result,
-    timing: Timing,
-    *,
-    observation: Observation,
-    manifest: Manifest,
-    seed: int,
-    bone_lengths: BoneLengths,
-) -> bytes:
-    """The body of ``PredictResponse``, or of ``PredictActionsResponse`` for a bundle with actions.
+@dataclass(kw_only=True, slots=True, eq=False)
+class Answer:
+    """Writes the answers to one request, in the worker's thread; then there are ``stages_s``.
 
-    Futures are rounded to 0.1 mm.
+    Numbers are rounded to 0.1 mm. Equal requests of equal ids have equal bytes up to ``timing_ms``,
+    which comes last.
     """
-    started_s = perf_counter()
-    caller = observation.caller
-    in_world = caller_futures(
-        result.futures,
-        observation,
-        manifest=manifest,
-        bone_lengths=bone_lengths,
-        segments=result.segments,
-    )
-    futures = np.ascontiguousarray(written(in_world, caller))
-    if manifest.actions is None:
-        answer = _continued(futures, result)
-    else:
-        segments = caller_segments(result.segments, manifest=manifest, fps=caller.fps)
-        answer = _performed(futures, segments, labels=manifest.actions.labels)
-    names = dict(zip(caller.order, caller.skeleton.joints, strict=True))
-    seconds = {
-        "queue": timing.queue_s,
-        "engine": timing.engine_s,
-        "answer": perf_counter() - started_s,
-    }
-    content = {
-        "id": str(uuid4()),
-        "model": {
-            "name": manifest.name,
-            "version": manifest.version,
-            "digest": manifest.digest,
-        },
-        "seed": seed,
-        "fps": caller.fps,
-        "skeleton": caller.skeleton.name,
-        "joints": [names[i] for i in range(len(names))],
-        **answer,
-        "warnings": list(observation.warnings),
-        "timing_ms": {name: round(1000.0 * value, 3) for name, value in seconds.items()},
-    }
-    return orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
 
+    id: str
+    media_type: str
+    observation: Observation
+    manifest: Manifest
+    seed: int
+    bone_lengths: BoneLengths
+    warnings: Sequence[str]
+    returned: Sequence[str] = ("futures",)
+    num_modes: int = 1
+    levels: Sequence[float] = ()
+    stages_s: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
 
-def _continued(futures: Float[np.ndarray, "N H J 3"], result: Result) -> dict[str, Any]:
-    return {
-        "num_frames": futures.shape[1],
-        "futures": futures,
-        "steps": {
-            "run": result.steps_run,
-            "of": result.steps_of,
-            "stopped_by": "end" if result.steps_run == result.steps_of else "num_steps",
-        },
-    }
+    def final(self, result: Result, timing: Timing) -> bytes:
+        """The body of ``PredictResponse``, or of ``PredictActionsResponse`` for actions."""
+        started_s = perf_counter()
+        part = self._continued(result) if self.manifest.actions is None else self._performed(result)
+        caller = self.observation.caller
+        names = dict(zip(caller.order, caller.skeleton.joints, strict=True))
+        content = self.head() | {
+            "fps": caller.fps,
+            "skeleton": caller.skeleton.name,
+            "joints": [names[i] for i in range(len(names))],
+            **part,
+            "warnings": [*self.observation.warnings, *self.warnings],
+        }
+        self.stages_s |= {
+            "queue": timing.queue_s,
+            "engine": timing.engine_s,
+            "answer": perf_counter() - started_s,
+        }
+        body = encoded(content | {"timing_ms": self.milliseconds()}, self.media_type)
+        self.stages_s["answer"] = perf_counter() - started_s
+        self.facts |= {
+            "steps_run": result.steps_run,
+            "steps_of": result.steps_of,
+            "stopped_by": result.stopped_by,
+        }
+        return body
 
+    def milliseconds(self) -> dict[str, float]:
+        """How long each stage took; that of the answer, so far."""
+        return {name: round(1000.0 * seconds, 3) for name, seconds in self.stages_s.items()}
 
-def _performed(
-    futures: Float[np.ndarray, "N H J 3"],
-    segments: Sequence[Sequence[Segment]],
-    *,
-    labels: Sequence[str],
-) -> dict[str, Any]:
-    """Each future as long as its actions took, and the frames of each action in it."""
-    return {
-        "futures": [
-            {
-                "num_frames": parts[-1].end,
-                "poses": future[: parts[-1].end],
-                "segments": [
-                    {
-                        "action": labels[part.action],
-                        "start": part.start,
-                        "end": part.end,
-                        "stopped": part.stopped,
-                    }
-                    for part in parts
-                ],
-            }
-            for future, parts in zip(futures, segments, strict=True)
-        ]
-    }
+    def preview(self, preview: Preview) -> bytes:
+        """Futures as they stand after a step."""
+        futures = written(self._in_world(preview.futures), self.observation.caller)
+        steps = {"run": preview.steps_run, "of": preview.steps_of}
+        content = {"id": self.id, "steps": steps, "futures": np.ascontiguousarray(futures)}
+        return encoded(content, self.media_type)
+
+    def head(self) -> dict[str, Any]:
+        """Which request and bundle it is about."""
+        model = self.manifest
+        return {
+            "id": self.id,
+            "model": {"name": model.name, "version": model.version, "digest": model.digest},
+            "seed": self.seed,
+        }
+
+    def _in_world(
+        self,
+        futures: Float[np.ndarray, "N H Jb 3"],
+        segments: Sequence[Sequence[Segment]] = (),
+    ) -> Float[np.ndarray, "N Hc J 3"]:
+        return caller_futures(
+            futures,
+            self.observation,
+            manifest=self.manifest,
+            bone_lengths=self.bone_lengths,
+            segments=segments,
+        )
+
+    def _continued(self, result: Result) -> dict[str, Any]:
+        in_world = self._in_world(result.futures)
+        content: dict[str, Any] = {"num_frames": in_world.shape[1]}
+        if "futures" in self.returned:
+            futures = written(in_world, self.observation.caller)
+            content["futures"] = np.ascontiguousarray(futures)
+        if "modes" in self.returned:
+            content["modes"] = [
+                {
+                    "probability": mode.probability,
+                    "sample": mode.sample,
+                    "members": list(mode.members),
+                }
+                for mode in modes(in_world, num_modes=self.num_modes)
+            ]
+        if "quantiles" in self.returned:
+            content["quantiles"] = self._quantiles(in_world)
+        steps = {"run": result.steps_run, "of": result.steps_of, "stopped_by": result.stopped_by}
+        return content | {"steps": steps}
+
+    def _quantiles(self, in_world: Float[np.ndarray, "N H J 3"]) -> dict[str, Any]:
+        """Balls in the caller's order, axes and units."""
+        caller = self.observation.caller
+        found = regions(
+            in_world, fps=caller.fps, calibration=self.manifest.calibration, levels=self.levels
+        )
+        units = UNITS_PER_METRE[caller.axes.units]
+        radius = np.empty_like(found.radius)
+        radius[:, :, list(caller.order)] = found.radius
+        decimals = DECIMALS - round(np.log10(units))
+        return {
+            "levels": list(found.levels),
+            "centre": np.ascontiguousarray(written(found.centre[None], caller)[0]),
+            "radius": np.round(radius * units, decimals).astype(np.float32),
+            "calibrated": found.calibrated,
+        }
+
+    def _performed(self, result: Result) -> dict[str, Any]:
+        """Each future as long as its actions took, and the frames of each action in it."""
+        caller = self.observation.caller
+        labels = self.manifest.actions.labels if self.manifest.actions else ()
+        futures = written(self._in_world(result.futures, result.segments), caller)
+        segments = caller_segments(result.segments, manifest=self.manifest, fps=caller.fps)
+        return {
+            "futures": [
+                {
+                    "num_frames": parts[-1].end,
+                    "poses": np.ascontiguousarray(future[: parts[-1].end]),
+                    "segments": [
+                        {
+                            "action": labels[part.action],
+                            "start": part.start,
+                            "end": part.end,
+                            "stopped": part.stopped,
+                        }
+                        for part in parts
+                    ],
+                }
+                for future, parts in zip(futures, segments, strict=True)
+            ]
+        }

@@ -1,44 +1,117 @@
 """The application: settings in, an ASGI app out."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from threading import Thread
+from typing import Any
 
 from fastapi import FastAPI
 
+from service import predictions
 from service.catalog import Catalog
+from service.guard import Guard
+from service.metrics import Metrics
 from service.problems import add_problem_responses
-from service.routes import router
+from service.routes import health, router
 from service.settings import Settings
+from service.telemetry import telemetry_config
+from service.visits import Visits
+from service.worker import Limits, Worker
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
     """The service; without settings it reads those of the environment.
 
     Bundles load in a thread of their own, so that the server answers /livez from the start.
+
+    Raises:
+        ServiceError: it is configured for something that is not installed.
     """
     settings = settings or Settings()
+    metrics = Metrics()
     catalog = Catalog(
-        settings.bundles, default_model=settings.default_model, threads=settings.threads
+        settings.bundles,
+        default_model=settings.default_model,
+        threads=settings.num_threads,
+        rows_per_step=settings.rows_per_step,
+        worker=partial(
+            Worker,
+            threads=settings.num_workers,
+            limits=Limits(
+                max_requests=settings.max_queued_requests, max_rows=settings.max_queued_rows
+            ),
+            observer=metrics,
+        ),
     )
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         loader = Thread(target=catalog.load, name="load-bundles", daemon=True)
         loader.start()
+        watch = asyncio.create_task(metrics.watch_event_loop())
         yield
-        loader.join()
-        catalog.stop()
+        watch.cancel()
+        await asyncio.to_thread(loader.join)
+        await asyncio.to_thread(catalog.stop)
 
     app = FastAPI(
         title="posefutures",
         summary="N plausible futures of a person's 3D motion",
         version="0.1.0",
         lifespan=lifespan,
+        telemetry=telemetry_config(settings.otel_endpoint),
     )
     app.state.settings = settings
     app.state.catalog = catalog
-    app.state.max_body_bytes = settings.max_body_bytes
+    app.state.metrics = metrics
+    app.state.draining = False
+    app.state.streams = set()
+    app.include_router(predictions.router)
     app.include_router(router)
+    app.include_router(health)
     add_problem_responses(app)
+    keys = [key.get_secret_value() for key in settings.api_keys]
+    app.add_middleware(
+        Guard,
+        api_keys=keys,
+        rate_limit=settings.rate_limit,
+        max_requests=settings.max_queued_requests,
+        seconds_until_free=catalog.seconds_until_free,
+    )
+    app.add_middleware(Visits, ended=metrics.visited)
+    _say_limits(app, settings)
     return app
+
+
+async def drain(app: FastAPI) -> None:
+    """Take no more predictions, and end those under way in ``drain_s`` with what is ready then."""
+    app.state.draining = True
+    entries = app.state.catalog.entries.values()
+    workers = [entry.worker for entry in entries if entry.worker is not None]
+    await asyncio.gather(*(worker.drain(app.state.settings.drain_s) for worker in workers))
+
+
+def _say_limits(app: FastAPI, settings: Settings) -> None:
+    """Let the OpenAPI document tell the limits, and the key that has to be sent."""
+    generate = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            document = generate()
+            schemas = document["components"]["schemas"]
+            for name in ("PredictRequest", "PredictActionsRequest"):
+                fields = schemas[name]["properties"]
+                fields["num_samples"]["maximum"] = settings.max_samples
+                fields["poses"]["maxItems"] = settings.max_frames
+            (seconds, _) = schemas["PredictRequest"]["properties"]["horizon_s"]["anyOf"]
+            seconds["maximum"] = settings.max_horizon_s
+            if settings.api_keys:
+                document["components"]["securitySchemes"] = {
+                    "key": {"type": "http", "scheme": "bearer"}
+                }
+                document["security"] = [{"key": []}]
+        return app.openapi_schema or {}
+
+    app.openapi = openapi  # type: ignore[method-assign]  # as FastAPI's documents tell to

@@ -1,18 +1,20 @@
-"""Reads a JSON body itself, so that its size, its type and its syntax each get their own error."""
+"""Reads a body itself, so that its size, its media type and its syntax each get their own error."""
 
-import json
+from asyncio import to_thread
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-import orjson
 from fastapi import Request, Response
 from fastapi.routing import APIRoute
 
-from service.errors import BodyTooLargeError, MalformedBodyError, MediaTypeError
+from service.errors import BodyTooLargeError
+from service.media import JSON, decoded, sent
+
+BIG_BODY_BYTES = 2**16  # some milliseconds of parsing, which the event loop has not got
 
 
-class JsonRoute(APIRoute):
-    """A route whose body is a JSON object of at most ``app.state.max_body_bytes``."""
+class BodyRoute(APIRoute):
+    """A route whose body is an object of at most ``app.state.settings.max_body_bytes``."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """The handler of FastAPI, given a request whose body was read and checked here."""
@@ -21,18 +23,25 @@ class JsonRoute(APIRoute):
             return handle
 
         async def checked(request: Request) -> Response:
-            _check_media_type(request.headers.get("content-type", ""))
-            body = await _read(request, limit=request.app.state.max_body_bytes)
-            return await handle(_Parsed(request, body, parsed(body)))
+            media_type = sent(request.headers.get("content-type", ""))
+            limit: int = request.app.state.settings.max_body_bytes
+            body = await _read(request, limit=limit)
+            if len(body) > BIG_BODY_BYTES:
+                content = await to_thread(decoded, body, media_type, limit=limit)
+            else:
+                content = decoded(body, media_type, limit=limit)
+            return await handle(_Parsed(request, body, content))
 
         return checked
 
 
 class _Parsed(Request):
-    """The same request, whose body has been read."""
+    """The same request, whose body has been read; to FastAPI it came as JSON."""
 
     def __init__(self, request: Request, body: bytes, content: dict[str, Any]) -> None:
-        super().__init__(request.scope, request.receive)
+        headers = [header for header in request.scope["headers"] if header[0] != b"content-type"]
+        scope = {**request.scope, "headers": [*headers, (b"content-type", JSON.encode())]}
+        super().__init__(scope, request.receive)
         self._bytes = body
         self._content = content
 
@@ -41,51 +50,6 @@ class _Parsed(Request):
 
     async def json(self) -> dict[str, Any]:
         return self._content
-
-
-def parsed(body: bytes) -> dict[str, Any]:
-    """The JSON object in a body; NaN and Infinity, which JSON lacks, are kept to be named later.
-
-    Raises:
-        MalformedBodyError: the body is not a JSON object.
-    """
-    try:
-        content = orjson.loads(body)
-    except orjson.JSONDecodeError as error:
-        content = _with_nan(body, error)
-    if not isinstance(content, dict):
-        raise MalformedBodyError(
-            f"the body: found a JSON {_KINDS[type(content)]}; it must be a JSON object.",
-            found=_KINDS[type(content)],
-            expected="a JSON object",
-        )
-    return content
-
-
-_KINDS = {list: "array", str: "string", int: "number", float: "number", bool: "boolean"} | {
-    type(None): "null"
-}
-
-
-def _with_nan(body: bytes, error: orjson.JSONDecodeError) -> Any:
-    try:
-        return json.loads(body)
-    except (ValueError, RecursionError):
-        raise MalformedBodyError(
-            f"the body: found no JSON: {error}; it must be a JSON object.",
-            found=str(error),
-            expected="a JSON object",
-        ) from error
-
-
-def _check_media_type(content_type: str) -> None:
-    media_type = content_type.split(";")[0].strip().lower()
-    if media_type != "application/json":
-        raise MediaTypeError(
-            f"content-type: found {media_type[:60] or 'none'}; it must be application/json.",
-            found=media_type[:60] or "none",
-            expected="application/json",
-        )
 
 
 async def _read(request: Request, *, limit: int) -> bytes:

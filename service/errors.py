@@ -3,18 +3,25 @@
 ServiceError                       status  problem
 ├── InputError                             the caller's fault
 │   ├── MalformedBodyError         400     malformed-body
+│   ├── UnauthorisedError          401     unauthorised: no key, or an unknown one
 │   ├── NotFoundError              404     not-found
+│   ├── UnknownRequestError        404     unknown-request: nothing of this id is under way
 │   ├── MethodError                405     method-not-allowed
+│   ├── NotAcceptableError         406     not-acceptable
+│   ├── CancelledRequestError      409     cancelled: by DELETE, or its id is under way already
 │   ├── BodyTooLargeError          413     body-too-large
 │   ├── MediaTypeError             415     unsupported-media-type
-│   └── FieldError                 422     invalid-field
-│       ├── PosesError             422     invalid-poses
-│       ├── TooFewFramesError      422     too-few-frames
-│       ├── UnknownSkeletonError   422     unknown-skeleton
-│       ├── UnknownModelError      422     unknown-model (404 in a path)
-│       ├── UnsuitableModelError   422     unsuitable-model: it performs actions, or performs none
-│       └── UnknownActionError     422     unknown-action
+│   ├── FieldError                 422     invalid-field
+│   │   ├── PosesError             422     invalid-poses
+│   │   ├── TooFewFramesError      422     too-few-frames
+│   │   ├── UnknownSkeletonError   422     unknown-skeleton
+│   │   ├── UnknownModelError      422     unknown-model (404 in a path)
+│   │   ├── UnsuitableModelError   422     unsuitable-model: it performs actions, or performs none
+│   │   └── UnknownActionError     422     unknown-action
+│   └── RateLimitedError           429     rate-limited: this caller asks too often
+├── OverloadedError                429     overloaded: the queue is full
 ├── UnavailableError               503     unavailable: loading, stopping or refused bundle
+├── DeadlineError                  504     deadline-too-short: not even one step fits
 └── EngineError                    500     prediction-failed
     ├── GraphError                 500     a graph could not run
     └── NonFiniteError             500     a graph gave NaN or infinity
@@ -29,6 +36,8 @@ class ServiceError(Exception):
     status: ClassVar[int] = 500
     slug: ClassVar[str] = "internal"
     title: ClassVar[str] = "The server failed"
+    retry_after_s: float | None = None
+    """Seconds after which the same request may be answered; None where waiting does not help."""
 
     def __init__(
         self, detail: str, *, pointer: str | None = None, found: str = "", expected: str = ""
@@ -55,6 +64,14 @@ class MalformedBodyError(InputError):
     title = "The body is not a JSON object"
 
 
+class UnauthorisedError(InputError):
+    """The request has no API key, or one that the server does not know."""
+
+    status = 401
+    slug = "unauthorised"
+    title = "An API key is needed"
+
+
 class NotFoundError(InputError):
     """Nothing lives at this path."""
 
@@ -63,12 +80,36 @@ class NotFoundError(InputError):
     title = "There is nothing at this path"
 
 
+class UnknownRequestError(InputError):
+    """No request of this id is under way."""
+
+    status = 404
+    slug = "unknown-request"
+    title = "No such request is under way"
+
+
 class MethodError(InputError):
     """The path does not take this method."""
 
     status = 405
     slug = "method-not-allowed"
     title = "The path does not take this method"
+
+
+class NotAcceptableError(InputError):
+    """The caller accepts no media type that this path answers in."""
+
+    status = 406
+    slug = "not-acceptable"
+    title = "The answer has none of the accepted media types"
+
+
+class CancelledRequestError(InputError):
+    """The request was cancelled by its id."""
+
+    status = 409
+    slug = "cancelled"
+    title = "The request was cancelled"
 
 
 class BodyTooLargeError(InputError):
@@ -80,7 +121,7 @@ class BodyTooLargeError(InputError):
 
 
 class MediaTypeError(InputError):
-    """The body is declared as something other than JSON."""
+    """The body is declared as a media type that is not read."""
 
     status = 415
     slug = "unsupported-media-type"
@@ -145,12 +186,45 @@ class UnknownActionError(FieldError):
     title = "The action is not known"
 
 
+class RateLimitedError(InputError):
+    """This caller has sent more requests than it may."""
+
+    status = 429
+    slug = "rate-limited"
+    title = "Too many requests of one caller"
+
+    def __init__(self, detail: str, *, retry_after_s: float) -> None:
+        super().__init__(detail)
+        self.retry_after_s = retry_after_s
+
+
+class OverloadedError(ServiceError):
+    """The server has as much to do as it takes on."""
+
+    status = 429
+    slug = "overloaded"
+    title = "The server is busy"
+
+    def __init__(self, detail: str, *, retry_after_s: float) -> None:
+        super().__init__(detail)
+        self.retry_after_s = retry_after_s
+
+
 class UnavailableError(ServiceError):
     """The model cannot answer now: still loading, stopping, or its bundle was refused."""
 
     status = 503
     slug = "unavailable"
     title = "The model cannot answer now"
+    retry_after_s = 1.0
+
+
+class DeadlineError(ServiceError):
+    """Not even one step fits between now and the deadline."""
+
+    status = 504
+    slug = "deadline-too-short"
+    title = "The deadline is too short"
 
 
 class EngineError(ServiceError):

@@ -6,7 +6,7 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
 from models.bundle import Manifest
 from models.motion.kinematics import bone_lengths
@@ -51,14 +51,14 @@ class Observation:
 
 
 def read_observation(
-    poses: Sequence[Any],
+    poses: Sequence[Any] | Shaped[np.ndarray, "..."],
     *,
     skeleton: Skeleton | OwnJoints,
     axes: Axes,
     fps: float,
     manifest: Manifest,
 ) -> Observation:
-    """The observation in JSON poses, whose last frame is now.
+    """The observation in poses as they were sent, whose last frame is now.
 
     Raises:
         PosesError: the poses are not those of a person.

@@ -1,4 +1,4 @@
-"""Nested lists from JSON as an array, or an error that says which number is wrong."""
+"""Poses as they are sent, as an array, or an error that says which number is wrong."""
 
 import json
 import sys
@@ -7,19 +7,23 @@ from itertools import chain
 from typing import Any, NoReturn
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from service.errors import PosesError
 
 _NUMBERS = {float, int}
 
 
-def poses_array(poses: Sequence[Any], *, num_joints: int) -> Float[np.ndarray, "T J 3"]:
-    """Poses in float64, a joint that is null as three NaN.
+def poses_array(
+    poses: Sequence[Any] | Shaped[np.ndarray, "..."], *, num_joints: int
+) -> Float[np.ndarray, "T J 3"]:
+    """Poses in float64, a joint that is null, or three NaN in an array, as three NaN.
 
     Raises:
         PosesError: a frame or joint has a wrong shape, or a coordinate is not a finite number.
     """
+    if isinstance(poses, np.ndarray):
+        return _checked(poses, num_joints)
     for frame_index, frame in enumerate(poses):
         _check_frame(frame, frame_index, num_joints)
     joints = list(chain.from_iterable(poses))
@@ -30,6 +34,25 @@ def poses_array(poses: Sequence[Any], *, num_joints: int) -> Float[np.ndarray, "
     array = np.full((len(joints), 3), np.nan)
     array[present] = _finite(list(chain.from_iterable(seen)), np.flatnonzero(present), num_joints)
     return array.reshape(len(poses), num_joints, 3)
+
+
+def _checked(poses: Shaped[np.ndarray, "..."], num_joints: int) -> Float[np.ndarray, "T J 3"]:
+    if poses.ndim != 3 or poses.shape[1:] != (num_joints, 3):
+        raise PosesError(
+            pointer="/poses",
+            found=f"an array of shape {poses.shape}",
+            expected=f"the skeleton has {num_joints} joints: its shape is (T, {num_joints}, 3)",
+        )
+    array = poses.astype(np.float64)
+    wrong = ~np.isfinite(array) & ~np.isnan(array).all(axis=-1, keepdims=True)
+    if wrong.any():
+        frame, joint, axis = np.argwhere(wrong)[0]
+        raise PosesError(
+            pointer=f"/poses/{frame}/{joint}/{axis}",
+            found=shown(float(array[frame, joint, axis])),
+            expected="a coordinate is a finite number; a joint that was not seen is three NaN",
+        )
+    return array
 
 
 def _refuse_joint(joints: Sequence[Any], num_joints: int) -> NoReturn:
@@ -87,10 +110,12 @@ def _pointer(joint_index: int, num_joints: int) -> str:
 
 
 def shown(value: object) -> str:
-    """What a JSON value is, in a few words."""
+    """What a value of a body is, in a few words."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
     if isinstance(value, list | dict):
         return f"{'a list' if isinstance(value, list) else 'an object'} of {len(value)}"
     if isinstance(value, float) and not np.isfinite(value):
         return "NaN" if np.isnan(value) else "infinity"
-    text = json.dumps(value)
+    text = json.dumps(value, default=lambda other: type(other).__name__)
     return text if len(text) <= 40 else f"{text[:37]}..."

@@ -1,28 +1,34 @@
 """Errors as problem+json (RFC 9457), wherever in the application they come from."""
 
+from itertools import groupby
+from math import ceil
+from operator import attrgetter
 from typing import Any
 
 import orjson
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from service.errors import FieldError, MethodError, NotFoundError, ServiceError
 from service.poses import shown
 from service.schemas import Problem
+from service.visits import CLIENT_GONE, ID_HEADER
 
 MEDIA_TYPE = "application/problem+json"
 
 
 def declared(*errors: type[ServiceError]) -> dict[int | str, dict[str, Any]]:
     """The errors of a route for the OpenAPI document."""
+    status = attrgetter("status")
     return {
-        error.status: {
+        code: {
             "model": Problem,
-            "description": error.title,
+            "description": "; ".join(error.title for error in alike),
             "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
         }
-        for error in errors
+        for code, alike in groupby(sorted(errors, key=status), status)
     }
 
 
@@ -31,31 +37,45 @@ def add_problem_responses(app: FastAPI) -> None:
     app.add_exception_handler(ServiceError, _on_service_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
+    app.add_exception_handler(ClientDisconnect, _on_disconnect)
     app.add_exception_handler(Exception, _on_exception)
 
 
 def problem(error: ServiceError, *, status: int | None = None) -> Response:
     """The response that tells a caller of an error."""
-    content = {
-        "type": f"/problems/{error.slug}",
-        "title": error.title,
-        "status": status or error.status,
-        "detail": error.detail,
-    }
-    optional = {"pointer": error.pointer, "found": error.found, "expected": error.expected}
-    content |= {key: value for key, value in optional.items() if value}
-    headers = {"Retry-After": "1"} if error.status == 503 else None
+    code = status or error.status
+    headers = {}
+    if error.retry_after_s is not None:
+        headers["Retry-After"] = str(max(1, ceil(error.retry_after_s)))
+    if code == 401:
+        headers["WWW-Authenticate"] = "Bearer"
     return Response(
-        orjson.dumps(content),
-        status_code=status or error.status,
+        orjson.dumps(content_of(error, status=code)),
+        status_code=code,
         media_type=MEDIA_TYPE,
         headers=headers,
     )
 
 
-async def _on_service_error(_: Request, error: Exception) -> Response:
+def content_of(error: ServiceError, *, status: int) -> dict[str, Any]:
+    """The problem that an error is."""
+    content = {
+        "type": f"/problems/{error.slug}",
+        "title": error.title,
+        "status": status,
+        "detail": error.detail,
+        "pointer": error.pointer or None,
+        "found": error.found or None,
+        "expected": error.expected or None,
+        "retry_after_s": error.retry_after_s,
+    }
+    return {key: value for key, value in content.items() if value is not None}
+
+
+async def _on_service_error(request: Request, error: Exception) -> Response:
     if not isinstance(error, ServiceError):
         raise error
+    request.state.visit.failed(error)
     return problem(error)
 
 
@@ -84,11 +104,19 @@ async def _on_http_exception(request: Request, error: Exception) -> Response:
     return problem(ServiceError(str(error.detail)), status=error.status_code)
 
 
-async def _on_exception(_: Request, __: Exception) -> Response:
-    return problem(ServiceError("the server: an unforeseen error; its log says which."))
+async def _on_disconnect(_: Request, __: Exception) -> Response:
+    return Response(status_code=CLIENT_GONE)
+
+
+async def _on_exception(request: Request, _: Exception) -> Response:
+    response = problem(ServiceError("the server: an unforeseen error; its log says which."))
+    response.headers[ID_HEADER] = request.state.visit.request_id  # beyond all middleware
+    return response
 
 
 def _field_error(error: dict[str, Any], body: object) -> FieldError:
+    if error["loc"][0] != "body":
+        body = {error["loc"][0]: {error["loc"][1]: error["input"]}}
     parts, at_fault = _path(error["loc"], body)
     pointer = "".join(f"/{str(part).replace('~', '~0').replace('/', '~1')}" for part in parts)
     message = str(error["msg"])

@@ -1,126 +1,25 @@
-"""The paths of the service: each turns a request into values, and values into a response."""
+"""The paths that tell of the service: what it can do, what it takes, and how it is."""
 
-import secrets
-from functools import partial
 from itertools import chain
-from typing import Annotated
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
+from prometheus_client import CONTENT_TYPE_LATEST
 
-from models.bundle import Manifest
-from models.motion.skeleton import SKELETONS, Skeleton
+from models.motion.skeleton import SKELETONS
 from service import schemas
-from service.actions import action_indices, max_frames
-from service.answer import json_answer
-from service.axes import Axes
-from service.body import JsonRoute
-from service.catalog import Catalog, Entry
-from service.engine import trajectory
-from service.errors import (
-    BodyTooLargeError,
-    EngineError,
-    FieldError,
-    MalformedBodyError,
-    MediaTypeError,
-    NotFoundError,
-    PosesError,
-    UnavailableError,
-    UnknownModelError,
-)
-from service.futures import BoneLengths, num_frames
-from service.observation import Observation, read_observation
+from service.body import BodyRoute
+from service.catalog import Entry
+from service.dependencies import TheCatalog, TheMetrics, TheSettings
+from service.errors import NotFoundError, UnauthorisedError, UnknownModelError
 from service.problems import declared, problem
-from service.settings import Settings
-from service.skeletons import OwnJoints, standard_skeleton
-from service.worker import Worker
 
-router = APIRouter(route_class=JsonRoute)
-
-
-def _catalog(request: Request) -> Catalog:
-    catalog: Catalog = request.app.state.catalog
-    return catalog
-
-
-def _settings(request: Request) -> Settings:
-    settings: Settings = request.app.state.settings
-    return settings
-
-
-_Catalog = Annotated[Catalog, Depends(_catalog)]
-_Settings = Annotated[Settings, Depends(_settings)]
-
-_PROBLEMS = declared(
-    MalformedBodyError, BodyTooLargeError, MediaTypeError, FieldError, EngineError, UnavailableError
-)
-
-
-@router.post(
-    "/v1/predict",
-    operation_id="predict_v1",
-    response_model=schemas.PredictResponse,
-    responses=_PROBLEMS,
-)
-@router.post(
-    "/predict",
-    operation_id="predict",
-    response_model=schemas.PredictResponse,
-    responses=_PROBLEMS,
-)
-async def predict(body: schemas.PredictRequest, catalog: _Catalog, settings: _Settings) -> Response:
-    """N futures of the person in the poses, in the caller's world, skeleton and frame rate."""
-    manifest, worker = catalog.ready(body.model, with_actions=False)
-    _check_limits(body, settings)
-    observation = _observation(body, manifest)
-    request = trajectory.Request(
-        observation=observation.positions,
-        num_samples=body.num_samples,
-        num_steps=body.num_steps,
-        seed=_seed(body),
-    )
-    return await _answered(
-        request, worker, observation, bone_lengths=body.bone_lengths, manifest=manifest
-    )
-
-
-@router.post(
-    "/v1/predict_actions",
-    operation_id="predict_actions_v1",
-    response_model=schemas.PredictActionsResponse,
-    responses=_PROBLEMS,
-)
-@router.post(
-    "/predict_actions",
-    operation_id="predict_actions",
-    response_model=schemas.PredictActionsResponse,
-    responses=_PROBLEMS,
-)
-async def predict_actions(
-    body: schemas.PredictActionsRequest, catalog: _Catalog, settings: _Settings
-) -> Response:
-    """N futures of the person in the poses, who performs the actions one after the other."""
-    manifest, worker = catalog.ready(body.model, with_actions=True)
-    indices = action_indices(body.actions, manifest)
-    longest = max_frames(body.max_seconds_per_action, manifest)
-    _check_limits(body, settings)
-    _check_num_poses(body, settings, manifest, frames=len(indices) * (longest or manifest.horizon))
-    observation = _observation(body, manifest)
-    request = trajectory.Request(
-        observation=observation.positions,
-        num_samples=body.num_samples,
-        seed=_seed(body),
-        actions=indices,
-        stop_threshold_m=body.stop_threshold,
-        max_frames=longest,
-    )
-    return await _answered(
-        request, worker, observation, bone_lengths=body.bone_lengths, manifest=manifest
-    )
+router = APIRouter(route_class=BodyRoute, responses=declared(UnauthorisedError))
+health = APIRouter()
 
 
 @router.get("/actions")
-async def actions(catalog: _Catalog) -> schemas.Actions:
+async def actions(catalog: TheCatalog) -> schemas.Actions:
     """The actions that can be asked for, those of the default model first."""
     default = catalog.default(with_actions=True)
     performers = catalog.performers()
@@ -139,7 +38,7 @@ async def actions(catalog: _Catalog) -> schemas.Actions:
 
 
 @router.get("/models")
-async def models(catalog: _Catalog) -> schemas.Models:
+async def models(catalog: TheCatalog) -> schemas.Models:
     """The bundles of this server, and which of them answers when a request names none."""
     summaries = [
         schemas.ModelSummary.model_validate(_summary(entry)) for entry in catalog.entries.values()
@@ -148,7 +47,7 @@ async def models(catalog: _Catalog) -> schemas.Models:
 
 
 @router.get("/models/{name}", response_model=schemas.ModelDetail, responses=declared(NotFoundError))
-async def model(name: str, catalog: _Catalog) -> schemas.ModelDetail | Response:
+async def model(name: str, catalog: TheCatalog) -> schemas.ModelDetail | Response:
     """One bundle: its manifest in short, its digest and its model card."""
     try:
         entry = catalog.entry(name)
@@ -174,93 +73,48 @@ async def skeletons() -> schemas.Skeletons:
     )
 
 
-@router.get("/livez")
+@router.get("/limits")
+async def limits(settings: TheSettings) -> schemas.Limits:
+    """What this server takes at most."""
+    values = settings.model_dump(include=set(schemas.Limits.model_fields))
+    return schemas.Limits(max_actions=schemas.MAX_ACTIONS, **values)
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
+async def metrics(request: Request, catalog: TheCatalog, metrics: TheMetrics) -> Response:
+    """What Prometheus collects."""
+    text = metrics.text(catalog, draining=request.app.state.draining)
+    return Response(text, headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+
+@health.get("/livez")
 async def livez() -> schemas.Live:
     """The process answers."""
     return schemas.Live()
 
 
-@router.get("/readyz", response_model=schemas.Ready, responses={503: {"model": schemas.Ready}})
-async def readyz(catalog: _Catalog) -> Response:
-    """200 once every bundle was tried and warmed up and one can answer; 503 before."""
+@health.get("/readyz", response_model=schemas.Ready, responses={503: {"model": schemas.Ready}})
+async def readyz(request: Request, catalog: TheCatalog) -> Response:
+    """200 while predictions are answered: each bundle warmed up, and the server not ending."""
     states = {
         name: f"{entry.state}: {entry.reason}" if entry.reason else entry.state
         for name, entry in catalog.entries.items()
     }
-    ready = schemas.Ready(status=catalog.state, default_model=catalog.default_model, models=states)
+    ready = schemas.Ready(
+        status="draining" if request.app.state.draining else catalog.state,
+        default_model=catalog.default_model,
+        models=states,
+        golden_digests={
+            name: entry.golden_digest
+            for name, entry in catalog.entries.items()
+            if entry.golden_digest is not None
+        },
+    )
     return JSONResponse(ready.model_dump(), status_code=200 if ready.status == "ready" else 503)
-
-
-def _seed(body: schemas.ObservedMotion) -> int:
-    return secrets.randbelow(schemas.MAX_SEED + 1) if body.seed is None else body.seed
-
-
-def _observation(body: schemas.ObservedMotion, manifest: Manifest) -> Observation:
-    return read_observation(
-        body.poses,
-        skeleton=_skeleton(body, manifest),
-        axes=Axes(up=body.axes.up, units=body.axes.units),
-        fps=body.fps or manifest.fps,
-        manifest=manifest,
-    )
-
-
-async def _answered(
-    request: trajectory.Request,
-    worker: Worker,
-    observation: Observation,
-    *,
-    bone_lengths: BoneLengths,
-    manifest: Manifest,
-) -> Response:
-    content = await worker.predict(
-        request,
-        partial(
-            json_answer,
-            observation=observation,
-            manifest=manifest,
-            seed=request.seed,
-            bone_lengths=bone_lengths,
-        ),
-    )
-    return Response(content, media_type="application/json")
-
-
-def _skeleton(body: schemas.ObservedMotion, manifest: Manifest) -> Skeleton | OwnJoints:
-    if isinstance(body.skeleton, schemas.SkeletonBody):
-        return body.skeleton.own_joints()
-    if body.skeleton is None or body.skeleton == manifest.skeleton.name:
-        return manifest.skeleton.skeleton()
-    return standard_skeleton(body.skeleton)
-
-
-def _check_limits(body: schemas.ObservedMotion, settings: Settings) -> None:
-    if body.num_samples > settings.max_samples:
-        raise FieldError(
-            pointer="/num_samples",
-            found=str(body.num_samples),
-            expected=f"this server gives at most {settings.max_samples}",
-        )
-    if len(body.poses) > settings.max_frames:
-        raise PosesError(
-            pointer="/poses",
-            found=f"{len(body.poses)} frames",
-            expected=f"this server takes at most {settings.max_frames}; send the last ones",
-        )
-
-
-def _check_num_poses(
-    body: schemas.PredictActionsRequest, settings: Settings, manifest: Manifest, *, frames: int
-) -> None:
-    """The engine holds futures at the bundle's rate, and the answer at the caller's."""
-    longest = max(frames, num_frames(frames, manifest=manifest, fps=body.fps or manifest.fps))
-    if body.num_samples * longest > settings.max_poses:
-        raise FieldError(
-            pointer="/num_samples",
-            found=f"{body.num_samples} futures of up to {longest} frames",
-            expected=f"this server answers with at most {settings.max_poses} poses; ask for fewer "
-            "samples or actions, or for less time or a lower rate",
-        )
 
 
 def _summary(entry: Entry) -> dict[str, object]:

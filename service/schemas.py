@@ -2,11 +2,14 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, WithJsonSchema
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, InstanceOf, Tag, WithJsonSchema
 
 from service.axes import Units, Up
+from service.engine.trajectory import StoppedBy
 from service.example import ACTIONS_EXAMPLE, EXAMPLE
 from service.futures import BoneLengths
+from service.quantiles import DEFAULT_LEVELS
 from service.skeletons import OwnJoints
 
 MAX_SEED = 2**53 - 1  # the largest integer that every JSON reader keeps
@@ -82,7 +85,7 @@ class AxesBody(_Body):
 class ObservedMotion(_Body):
     """An observed motion, and what every request may say of it and of its futures."""
 
-    poses: Annotated[list[Any], WithJsonSchema(_POSES_SCHEMA)]
+    poses: Annotated[list[Any] | InstanceOf[np.ndarray], WithJsonSchema(_POSES_SCHEMA)]
     skeleton: SkeletonField | None = Field(
         default=None, description="a name of GET /skeletons, or own joints; the model's by default"
     )
@@ -99,6 +102,13 @@ class ObservedMotion(_Body):
         default="observed",
         description="`observed` keeps the person's own; `free` is what the network said",
     )
+    deadline_ms: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="after the arrival; then the answer is what is ready, as X-Request-Timeout-"
+        "Seconds says it too: the smaller one counts",
+    )
 
 
 class PredictRequest(ObservedMotion):
@@ -108,6 +118,31 @@ class PredictRequest(ObservedMotion):
 
     num_steps: int | None = Field(
         default=None, ge=1, description="stop after so many of the model's denoising steps"
+    )
+    tolerance_m: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="stop a future as soon as a step moves none of its joints by so many metres",
+    )
+    horizon_s: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="seconds to predict; the model's by default; longer futures are rolled out "
+        "from their own last frames, and a warning says so",
+    )
+    returned: list[Literal["futures", "modes", "quantiles"]] = Field(
+        default=["futures"], min_length=1, alias="return", description="parts of the answer"
+    )
+    num_modes: int = Field(
+        default=5, ge=1, description="representative futures, where modes are returned"
+    )
+    quantile_levels: list[Annotated[float, Field(gt=0, lt=1)]] = Field(
+        default=list(DEFAULT_LEVELS),
+        min_length=1,
+        max_length=16,
+        description="of the balls that hold a joint so often, where quantiles are returned",
     )
 
 
@@ -145,11 +180,11 @@ class ModelRef(_Body):
 
 
 class Steps(_Body):
-    """Denoising steps that ran, of those there are."""
+    """Denoising steps that ran, at most, of those there are."""
 
     run: int
     of: int
-    stopped_by: Literal["end", "num_steps"]
+    stopped_by: StoppedBy
 
 
 class Answer(_Body):
@@ -165,12 +200,29 @@ class Answer(_Body):
     timing_ms: dict[str, float]
 
 
+class Mode(_Body):
+    """A future that stands for others."""
+
+    probability: float
+    sample: int = Field(description="its index among the futures")
+    members: list[int] = Field(description="indices of the futures it stands for, its own included")
+
+
+class Quantiles(_Body):
+    """Balls about one centre, in which each joint of each frame is as often as their level says."""
+
+    levels: list[float]
+    centre: list[Any] = Field(description="[frames][joints][x, y, z]")
+    radius: list[Any] = Field(description="[levels][frames][joints]")
+    calibrated: bool = Field(description="whether it was measured that they hold it so often")
+
+
 class PredictResponse(Answer):
     """Futures in the caller's world, skeleton, axes, units and rate."""
 
     num_frames: int
     futures: Annotated[
-        list[Any],
+        list[Any] | None,
         WithJsonSchema(
             {
                 "type": "array",
@@ -179,7 +231,9 @@ class PredictResponse(Answer):
                 "items": _POSES_SCHEMA,
             }
         ),
-    ]
+    ] = None
+    modes: list[Mode] | None = Field(default=None, description="the likeliest first")
+    quantiles: Quantiles | None = None
     steps: Steps
 
 
@@ -291,9 +345,28 @@ class Live(_Body):
 class Ready(_Body):
     """Whether predictions are answered, and the state of each bundle."""
 
-    status: Literal["loading", "ready", "unavailable"]
+    status: Literal["loading", "ready", "unavailable", "draining"]
     default_model: str | None
     models: dict[str, str]
+    golden_digests: dict[str, str] = Field(
+        description="of the answer that each ready bundle gave to one and the same request; "
+        "replicas whose digests are equal answer alike"
+    )
+
+
+class Limits(_Body):
+    """What this server takes at most."""
+
+    max_samples: int = Field(description="of one request")
+    max_frames: int = Field(description="observed, of one request")
+    max_poses: int = Field(description="of all futures of one answer")
+    max_actions: int = Field(description="of one request")
+    max_horizon_s: float
+    max_body_bytes: int
+    max_queued_requests: int = Field(description="under way")
+    max_queued_rows: int = Field(description="samples under way, for one model")
+    max_streams: int = Field(description="open at a time")
+    rate_limit: str | None = Field(description="predictions of each caller")
 
 
 class Problem(BaseModel):
@@ -306,3 +379,6 @@ class Problem(BaseModel):
     pointer: str | None = Field(default=None, description="the field, as a JSON pointer")
     found: str | None = None
     expected: str | None = None
+    retry_after_s: float | None = Field(
+        default=None, description="when to ask again, where it helps"
+    )

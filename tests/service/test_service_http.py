@@ -1,7 +1,10 @@
+import re
+from itertools import chain
+
 import numpy as np
 import orjson
 import pytest
-from in_memory import Service
+from in_memory import JSON, Service, dumped, untimed
 from tiny_bundles import walking
 
 from models.motion.kinematics import bone_lengths, rotate_yaw
@@ -32,7 +35,11 @@ def test_answer_says_all_there_is_to_know(service: Service):
     assert np.shape(answer["futures"]) == (3, 60, 21, 3)
     assert answer["steps"] == {"run": 10, "of": 10, "stopped_by": "end"}
     assert answer["warnings"] == []
-    assert all(time >= 0 for time in answer["timing_ms"].values())
+    assert answer["id"] == response.headers["x-request-id"]
+    stages = re.findall(r"(\w+);dur=([\d.]+)(?:, |$)", response.headers["server-timing"])
+    assert (
+        [name for name, _ in stages] == list(answer["timing_ms"]) == ["queue", "engine", "answer"]
+    )
 
 
 def test_only_poses_are_required(service: Service):
@@ -248,20 +255,157 @@ def test_health_is_told(service: Service):
     ready = service.get("/readyz")
     assert ready.status_code == 200
     assert ready.json()["models"] == {"diffusion": "ready", "still": "ready"}
+    digests = ready.json()["golden_digests"]
+    assert set(digests) == {"diffusion", "still"}
+    assert digests["diffusion"] != digests["still"]
 
 
 def test_documents_declare_every_error(service: Service):
     assert service.get("/docs").status_code == 200
     document = service.get("/openapi.json").json()
     responses = document["paths"]["/predict"]["post"]["responses"]
-    assert set(responses) == {"200", "400", "413", "415", "422", "500", "503"}
+    assert set(responses) == {
+        "200", "400", "401", "406", "409", "413", "415", "422", "429", "500", "503", "504",
+    }  # fmt: skip
     for status, response in responses.items():
         media_type = "application/json" if status == "200" else "application/problem+json"
         assert media_type in response["content"]
+    assert set(responses["200"]["content"]) == {
+        "application/json", "application/msgpack", "application/x-npz", "text/event-stream",
+        "application/x-ndjson",
+    }  # fmt: skip
     assert "Problem" in document["components"]["schemas"]
+    assert set(document["paths"]["/requests/{request_id}"]["delete"]["responses"]) >= {
+        "204", "401", "404",
+    }  # fmt: skip
 
 
 def test_example_of_the_documents_works(service: Service):
     document = service.get("/openapi.json").json()
     (example,) = document["components"]["schemas"]["PredictRequest"]["examples"]
     assert service.post(example).status_code == 200
+
+
+def test_equal_requests_of_equal_ids_have_equal_bytes(service: Service):
+    body = dumped({"poses": WALK, "seed": 8, "num_samples": 3})
+    headers = JSON | {"x-request-id": "mine.1"}
+    first, again = (
+        service.request("POST", "/predict", content=body, headers=headers) for _ in range(2)
+    )
+    assert first.headers["x-request-id"] == "mine.1"
+    assert orjson.loads(first.content)["id"] == "mine.1"
+    assert untimed(first.content) == untimed(again.content)
+
+
+@pytest.mark.parametrize("asked", ["", "with space", "x" * 65, "a\u00e9"])
+def test_id_that_is_not_well_formed_is_replaced(service: Service, asked: str):
+    headers = {"x-request-id": asked.encode("latin-1")}
+    made = service.request("GET", "/livez", headers=headers).headers["x-request-id"]
+    assert re.fullmatch(r"[0-9a-f-]{36}", made)
+
+
+def test_every_answer_has_an_id_even_that_there_is_none(service: Service):
+    for path in ("/models", "/nowhere", "/predict"):
+        assert service.get(path).headers["x-request-id"]
+
+
+@pytest.mark.parametrize("fps", [30.0, 50.0])
+def test_horizon_may_be_shorter_or_longer_and_longer_is_said(service: Service, fps: float):
+    poses = walking(round(fps * 0.6), fps=fps)
+    options = {"poses": poses, "fps": fps, "seed": 3, "num_samples": 2}
+    usual = orjson.loads(service.post(options).content)
+    for seconds, warns in ((0.5, False), (2.0, False), (5.0, True)):
+        answer = orjson.loads(service.post(options | {"horizon_s": seconds}).content)
+        assert answer["num_frames"] == round(seconds * fps)
+        assert np.shape(answer["futures"]) == (2, answer["num_frames"], 21, 3)
+        assert bool(answer["warnings"]) == warns
+        common = min(answer["num_frames"], usual["num_frames"]) - 1  # the last may be resampled
+        np.testing.assert_allclose(
+            np.array(answer["futures"])[:, :common],
+            np.array(usual["futures"])[:, :common],
+            atol=3e-3,
+        )
+    assert "was made for 2 s; from there to 5 s" in answer["warnings"][0]
+
+
+def test_settled_futures_stop_early_and_say_so(service: Service):
+    answer = orjson.loads(service.post({"poses": WALK, "seed": 1, "tolerance_m": 100.0}).content)
+    assert answer["steps"]["stopped_by"] == "tolerance"
+    assert answer["steps"]["run"] < answer["steps"]["of"] == 10
+
+
+def test_deadline_that_is_far_changes_nothing(service: Service):
+    options = {"poses": WALK, "seed": 1, "num_samples": 2}
+    relaxed = orjson.loads(service.post(options | {"deadline_ms": 1e6}).content)
+    assert relaxed["steps"] == {"run": 10, "of": 10, "stopped_by": "end"}
+    assert relaxed["futures"] == orjson.loads(service.post(options).content)["futures"]
+
+
+@pytest.mark.parametrize("where", ["body", "header"])
+def test_smaller_of_two_deadlines_counts(service: Service, where: str):
+    short = {"body": 1e-6, "header": "1000"} if where == "body" else {"body": 1e6, "header": "1e-9"}
+    body = dumped({"poses": WALK, "deadline_ms": short["body"]})
+    headers = JSON | {"x-request-timeout-seconds": str(short["header"])}
+    response = service.request("POST", "/predict", content=body, headers=headers)
+    assert (response.status_code, response.json()["type"]) == (504, "/problems/deadline-too-short")
+
+
+@pytest.mark.parametrize("asked", ["soon", "0", "-1", "nan", "inf"])
+def test_timeout_header_that_is_no_time_is_refused(service: Service, asked: str):
+    headers = JSON | {"x-request-timeout-seconds": asked}
+    body = dumped({"poses": WALK})
+    response = service.request("POST", "/predict", content=body, headers=headers)
+    problem = response.json()
+    assert (response.status_code, problem["type"]) == (422, "/problems/invalid-field")
+    assert problem["pointer"] == "/header/X-Request-Timeout-Seconds"
+    assert asked in problem["found"]
+
+
+def test_modes_share_out_the_futures(service: Service):
+    options = {"poses": WALK, "seed": 2, "num_samples": 12}
+    answer = orjson.loads(
+        service.post(options | {"return": ["futures", "modes"], "num_modes": 3}).content
+    )
+    modes = answer["modes"]
+    assert len(modes) == 3
+    assert sum(mode["probability"] for mode in modes) == pytest.approx(1.0)
+    assert sorted(chain(*(mode["members"] for mode in modes))) == list(range(12))
+    assert all(mode["sample"] in mode["members"] for mode in modes)
+    alone = orjson.loads(service.post(options | {"return": ["modes"], "num_modes": 3}).content)
+    assert (alone["modes"], alone.get("futures")) == (modes, None)
+
+
+@pytest.mark.parametrize("units", ["m", "mm"])
+def test_quantiles_are_in_the_callers_order_axes_and_units(service: Service, units: str):
+    order = np.random.default_rng(1).permutation(21)
+    scale = {"m": 1.0, "mm": 1000.0}[units]
+    y_up = np.ascontiguousarray(WALK[:, order][..., [1, 2, 0]]) * scale
+    options = {"seed": 2, "num_samples": 30, "return": ["futures", "quantiles"],
+               "quantile_levels": [0.5, 0.9]}  # fmt: skip
+    joints = [BODY21.joints[i] for i in order]
+    answer = orjson.loads(
+        service.post({"poses": y_up, "axes": {"up": "y", "units": units},
+                      "skeleton": {"joints": joints}} | options).content
+    )  # fmt: skip
+    quantiles = answer["quantiles"]
+    futures, centre = np.array(answer["futures"]), np.array(quantiles["centre"])
+    np.testing.assert_allclose(centre, futures.mean(axis=0), atol=2e-4 * scale)
+    radius = np.array(quantiles["radius"])
+    assert radius.shape == (2, 60, 21)
+    assert (radius[1] >= radius[0]).all()
+    distances = np.linalg.norm(futures - centre, axis=-1)
+    inside = (distances[:, None] <= radius + 2e-4 * scale).mean(axis=0)  # (L, H, J)
+    assert (inside[0] >= 0.5).all()
+    assert (inside[1] >= 0.9).all()
+    assert (inside[0] <= 0.6).mean() > 0.9
+
+
+def test_limits_are_told(service: Service):
+    limits = service.get("/limits").json()
+    assert limits["max_samples"] == 200
+    assert limits["rate_limit"] is None
+    schemas = service.get("/openapi.json").json()["components"]["schemas"]
+    fields = schemas["PredictRequest"]["properties"]
+    assert fields["num_samples"]["maximum"] == limits["max_samples"]
+    assert fields["poses"]["maxItems"] == limits["max_frames"]
+    assert fields["horizon_s"]["anyOf"][0]["maximum"] == limits["max_horizon_s"]

@@ -66,6 +66,17 @@ CASES = [
     ("invalid-poses", "/poses", fields(poses=[[[0, 0, 0]] * 21] * 15), "a body 0 m across"),
     ("invalid-poses", "/axes/units", fields(poses=scaled(1000)), "a body 1.64e+03 m across"),
     ("invalid-poses", "/axes/units", fields(poses=scaled(100)), "a body 164 m across"),
+    ("invalid-field", "/deadline_ms", fields(deadline_ms=0), "0"),
+    ("invalid-field", "/tolerance_m", fields(tolerance_m=-1), "-1"),
+    ("invalid-field", "/horizon_s", fields(horizon_s=0), "0"),
+    ("invalid-field", "/horizon_s", fields(horizon_s=10.5), "10.5 s"),
+    ("invalid-field", "/num_samples", fields(num_samples=200, horizon_s=10, fps=300, poses=walking(
+        150, fps=300.0)), "200 futures of up to 3000 frames"),
+    ("invalid-field", "/return", fields(**{"return": []}), "a list of 0"),
+    ("invalid-field", "/return/0", fields(**{"return": ["past"]}), '"past"'),
+    ("invalid-field", "/num_modes", fields(num_modes=0), "0"),
+    ("invalid-field", "/quantile_levels/1", fields(quantile_levels=[0.5, 1.0]), "1.0"),
+    ("invalid-field", "/num_samples", fields(**{"return": ["quantiles"]}), "1"),
     ("too-few-frames", "/poses", fields(poses=WALK[:14]), "14 frames at 30 fps"),
     ("too-few-frames", "/poses", fields(poses=[]), "0 frames at 30 fps"),
     ("too-few-frames", "/poses", fields(fps=60), "15 frames at 60 fps"),
@@ -196,6 +207,10 @@ def test_every_problem_of_the_tree_is_reached_by_these_tests():
         "method-not-allowed", "prediction-failed",
         "unavailable",  # test_service_catalog
         "unsuitable-model", "unknown-action",  # test_service_actions
+        "deadline-too-short",  # test_service_http
+        "not-acceptable",  # test_service_media
+        "overloaded", "rate-limited", "unauthorised",  # test_service_overload
+        "cancelled", "unknown-request",  # test_service_delivery
     }  # fmt: skip
     abstract = {"internal", "bad-request"}
     assert family(ServiceError) - abstract == reached

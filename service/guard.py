@@ -1,0 +1,97 @@
+"""Who may ask, how often, and how many at a time, before anything is read of a request."""
+
+import time
+from collections.abc import Callable, Sequence
+from hashlib import sha256
+from hmac import compare_digest
+
+from limits import parse
+from limits.aio.storage import MemoryStorage
+from limits.aio.strategies import MovingWindowRateLimiter
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.errors import OverloadedError, RateLimitedError, ServiceError, UnauthorisedError
+from service.problems import problem
+
+OPEN_PATHS = ("/livez", "/readyz")
+
+
+class Guard:
+    """Middleware that refuses strangers, where there are keys, and what is too much.
+
+    A rate, such as ``60/minute``, is that of a key, else of an address; it counts what computes, as
+    does ``max_requests``, the most that may be under way. To refuse must cost next to nothing: at
+    ten times the load that a server can bear it is most of what it does.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        api_keys: Sequence[str],
+        rate_limit: str | None,
+        max_requests: int,
+        seconds_until_free: Callable[[], float],
+    ) -> None:
+        self._app = app
+        self._max_requests = max_requests
+        self._num_requests = 0
+        self._seconds_until_free = seconds_until_free
+        self._keys = [_digest(key) for key in api_keys]
+        self._rate = parse(rate_limit) if rate_limit else None
+        self._limiter = MovingWindowRateLimiter(MemoryStorage())
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or answer 401 or 429."""
+        app, computes = self._app, scope.get("method") == "POST"
+        if scope["type"] in ("http", "websocket") and scope["path"] not in OPEN_PATHS:
+            try:
+                caller = self._caller(scope)
+                if computes:
+                    self._check_room()
+                    await self._count(caller)
+            except ServiceError as error:
+                app, computes = problem(error), False
+                if scope["type"] == "http":
+                    scope["state"]["visit"].failed(error)
+        self._num_requests += computes
+        try:
+            await app(scope, receive, send)
+        finally:
+            self._num_requests -= computes
+
+    def _caller(self, scope: Scope) -> str:
+        scheme, _, key = Headers(scope=scope).get("authorization", "").partition(" ")
+        found = _digest(key.strip()) if scheme.lower() == "bearer" else b""
+        # Every key is compared, so that the time taken tells nothing.
+        known = sum(compare_digest(found, digest) for digest in self._keys)
+        if self._keys and not known:
+            raise UnauthorisedError(
+                f"authorization: found {'an unknown key' if found else 'no key'}; it must be "
+                "Bearer and an API key of this server.",
+                found="an unknown key" if found else "no key",
+                expected="Bearer and an API key of this server",
+            )
+        return found.hex() if known else str((scope.get("client") or ("unknown",))[0])
+
+    def _check_room(self) -> None:
+        if self._num_requests >= self._max_requests:
+            raise OverloadedError(
+                f"the server: found {self._num_requests} requests under way; it takes at most "
+                f"{self._max_requests}.",
+                retry_after_s=self._seconds_until_free(),
+            )
+
+    async def _count(self, caller: str) -> None:
+        if self._rate is not None and not await self._limiter.hit(self._rate, caller):
+            window = await self._limiter.get_window_stats(self._rate, caller)
+            raise RateLimitedError(
+                f"the caller: found more requests than its rate; at most {self._rate} are "
+                "answered.",
+                retry_after_s=max(0.0, window.reset_time - time.time()),
+            )
+
+
+def _digest(key: str) -> bytes:
+    return sha256(key.encode()).digest()
