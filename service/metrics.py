@@ -3,7 +3,6 @@
 import asyncio
 from collections import deque
 from time import perf_counter
-from typing import Literal
 
 from prometheus_client import (
     CollectorRegistry,
@@ -16,6 +15,7 @@ from prometheus_client import (
 
 from service.catalog import Catalog
 from service.visits import Visit
+from service.worker import Outcome
 
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 _ROWS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
@@ -77,7 +77,7 @@ class Metrics:
         self,
         *,
         model: str,
-        outcome: Literal["finished", "failed", "cancelled", "refused"],
+        outcome: Outcome,
         stopped_by: str | None,
         steps_run: int,
         steps_of: int,

@@ -76,11 +76,19 @@ def regions(
     ranks = np.ceil(np.multiply(levels, count + 1)).astype(int)
     radius = np.sort(away, axis=0)[np.minimum(ranks, count) - 1]
     if calibration is not None:
-        times = np.arange(1, len(centre) + 1) / fps
-        radius *= np.stack([calibration.at(level, times) for level in levels])[:, :, None]
+        factors = widening(calibration, levels, num_frames=len(centre), fps=fps)
+        radius *= factors[:, :, None]
     return Regions(
         levels=tuple(levels),
         centre=centre,
         radius=radius,
         calibrated=calibration is not None,
     )
+
+
+def widening(
+    calibration: CalibrationSpec, levels: Sequence[float], *, num_frames: int, fps: float
+) -> Float[np.ndarray, "L H"]:
+    """What multiplies the radius of each level and frame."""
+    times = np.arange(1, num_frames + 1) / fps
+    return np.stack([calibration.at(level, times) for level in levels])

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,7 +17,7 @@ from training.action_metrics import (
     warped_diversity,
 )
 from training.fid import fid
-from training.tables import as_json, heading, percent, table
+from training.tables import Report, heading, percent, table
 
 COLUMNS: tuple[tuple[str, str], ...] = (  # heading, how a row shows it
     ("predictor", "{name}"),
@@ -246,19 +245,8 @@ class ActionRow:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class ActionEvaluation:
-    """All rows, and what made them."""
-
-    command: str
-    protocol: Mapping[str, Any]
-    rows: tuple[ActionRow, ...]
-
-    def json(self) -> str:
-        """Everything, as JSON."""
-        return as_json(self)
-
-    def __str__(self) -> str:
-        return self.markdown()
+class ActionEvaluation(Report[ActionRow]):
+    """The rows of predictors of actions."""
 
     def markdown(self) -> str:
         """A table of all rows, then what each makes of every action and of sequences of them."""

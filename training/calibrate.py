@@ -14,9 +14,9 @@ from tqdm import tqdm
 from models.bundle import CalibrationSpec, Manifest, read_manifest, write_calibration
 from service.engine.engine import Engine
 from service.engine.runner import Runner
-from service.quantiles import regions
+from service.quantiles import regions, widening
 from training.data.corpora import take_name
-from training.data.store import Store, select
+from training.data.store import Store
 from training.evaluate import (
     Cutting,
     EvaluateError,
@@ -140,7 +140,7 @@ def calibrate(  # noqa: PLR0913  # a measurement's protocol, spelled out
         num_observed=num_observed, horizon=horizon, stride=stride, max_windows=max_windows
     )
     tests = [
-        cut_group(name, select(store.clips, tuple(chosen)), store, cutting)
+        cut_group(name, chosen, store, cutting)
         for name, chosen in {", ".join(hold): hold, **groups}.items()
     ]
     for test in tests:
@@ -228,8 +228,7 @@ def _fitted(
 
 
 def _factors(calibration: CalibrationSpec, manifest: Manifest) -> Float[np.ndarray, "L H"]:
-    times = np.arange(1, manifest.horizon + 1) / manifest.fps
-    return np.stack([calibration.at(level, times) for level in calibration.levels])
+    return widening(calibration, calibration.levels, num_frames=manifest.horizon, fps=manifest.fps)
 
 
 def _covered(reaches: Reaches, factors: Float[np.ndarray, "L H"]) -> Float[np.ndarray, "L"]:

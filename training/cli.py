@@ -271,7 +271,7 @@ def steps_command(
         seed=seed,
         command=_command(),
     )
-    typer.echo(curve)
+    typer.echo(curve, nl=False)
 
 
 def _command() -> str:

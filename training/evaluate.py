@@ -99,10 +99,7 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
     cutting = Cutting(
         num_observed=num_observed, horizon=horizon, stride=stride, max_windows=max_windows
     )
-    tests = [
-        cut_group(name, select(store.clips, tuple(chosen)), store, cutting)
-        for name, chosen in groups.items()
-    ]
+    tests = [cut_group(name, chosen, store, cutting) for name, chosen in groups.items()]
     data = {manifest.name: learnt_from(manifest, store) for _, manifest in bundles}
     predictors: dict[str, Predictor] = {
         REFERENCE: Extrapolation(rule=held, skeleton=store.skeleton, horizon=horizon),
@@ -162,13 +159,14 @@ def common_shape(manifests: Sequence[Manifest], store: Store) -> tuple[int, int]
     return shapes.pop()
 
 
-def cut_group(name: str, clips: tuple[ClipRecord, ...], store: Store, cutting: Cutting) -> Group:
-    """Windows of clips.
+def cut_group(name: str, selectors: Sequence[str], store: Store, cutting: Cutting) -> Group:
+    """Windows of the clips that are selected.
 
     Raises:
-        EvaluateError: there are no clips.
-        StoreError: none of them is long enough.
+        EvaluateError: there are no such clips.
+        StoreError: a selector is wrong, or no clip is long enough.
     """
+    clips = select(store.clips, tuple(selectors))
     if not clips:
         raise EvaluateError(f"{name}: found no clip of this group in the store.")
     num_observed, num_frames = cutting.num_observed, cutting.num_observed + cutting.horizon

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from models.motion.skeleton import Skeleton
 from training import metrics
-from training.tables import as_json, heading, percent, table
+from training.tables import Report, heading, percent, table
 
 COLUMNS: tuple[tuple[str, str], ...] = (  # heading, how a row shows it
     ("predictor", "{name}"),
@@ -71,19 +71,8 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Evaluation:
-    """All rows, and what made them."""
-
-    command: str
-    protocol: Mapping[str, Any]
-    rows: tuple[Row, ...]
-
-    def json(self) -> str:
-        """Everything, as JSON."""
-        return as_json(self)
-
-    def __str__(self) -> str:
-        return self.markdown()
+class Evaluation(Report[Row]):
+    """The rows of predictors on groups of windows."""
 
     def markdown(self) -> str:
         """A table for each group of windows and treatment of bones."""

@@ -1,11 +1,10 @@
 """What stopping a bundle after fewer denoising steps costs, and what it saves."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import process_time
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,11 +17,11 @@ from service.engine.runner import Runner
 from service.engine.trajectory import Request
 from service.quantiles import regions
 from training.contact_sheet import save_small
-from training.data.store import Store, select
+from training.data.store import Store
 from training.evaluate import Cutting, Group, common_shape, cut_group, learnt_from, trained_on
 from training.predictors import BundlePredictor
 from training.scores import Row, Scorer
-from training.tables import MISSING, as_json, heading, percent, table
+from training.tables import MISSING, Report, heading, percent, table
 
 COVERED_LEVEL = 0.9
 COLUMNS: tuple[tuple[str, str], ...] = (
@@ -48,20 +47,14 @@ PANELS = (("ade", "ADE, m"), ("fde", "FDE, m"), ("apd", "APD, m"), ("cmd", "CMD"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class StepCurve:
+class StepCurve(Report[Row]):
     """A row for each number of steps, the last being all of them."""
 
-    command: str
-    protocol: Mapping[str, Any]
-    rows: tuple[Row, ...]
-
-    def json(self) -> str:
-        """Everything, as JSON."""
-        return as_json(self)
-
-    def __str__(self) -> str:
+    def markdown(self) -> str:
+        """One table."""
         rows = (row.values() for row in self.rows)
-        return "\n".join([*heading(self.command, self.protocol, LEGEND), "", *table(COLUMNS, rows)])
+        lines = [*heading(self.command, self.protocol, LEGEND), "", *table(COLUMNS, rows)]
+        return "\n".join(lines) + "\n"
 
     def figure(self) -> Figure:
         """Each quality against the steps, and below against the time."""
@@ -118,7 +111,7 @@ def step_curve(  # noqa: PLR0913  # a measurement's protocol, spelled out
     cutting = Cutting(
         num_observed=num_observed, horizon=horizon, stride=stride, max_windows=max_windows
     )
-    group = cut_group(", ".join(hold), select(store.clips, tuple(hold)), store, cutting)
+    group = cut_group(", ".join(hold), hold, store, cutting)
     engine = Engine(Runner(manifest, folder, threads=1))
     seconds = _timed(engine, group, num_samples=num_samples, rounds=rounds)
     shares = np.median(seconds / seconds[:, -1:], axis=0)
@@ -161,7 +154,7 @@ def step_curve(  # noqa: PLR0913  # a measurement's protocol, spelled out
     out.mkdir(parents=True, exist_ok=True)
     path = out / f"steps_{manifest.name}"
     path.with_suffix(".json").write_text(curve.json())
-    path.with_suffix(".md").write_text(f"{curve}\n")
+    path.with_suffix(".md").write_text(curve.markdown())
     save_small(curve.figure(), path.with_suffix(".png"))
     return curve
 

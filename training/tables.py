@@ -2,15 +2,34 @@
 
 import dataclasses
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 MISSING = "-"
 
+RowT = TypeVar("RowT")
 
-def as_json(evaluation: Any) -> str:
-    """Everything that a dataclass holds."""
-    return json.dumps(dataclasses.asdict(evaluation), indent=1)
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Report(ABC, Generic[RowT]):
+    """All rows of a measurement, and what made them."""
+
+    command: str
+    protocol: Mapping[str, Any]
+    rows: tuple[RowT, ...]
+
+    def json(self) -> str:
+        """Everything, as JSON."""
+        return json.dumps(dataclasses.asdict(self), indent=1)
+
+    def __str__(self) -> str:
+        return self.markdown()
+
+    @abstractmethod
+    def markdown(self) -> str:
+        """Everything that is worth reading, as tables."""
 
 
 def heading(command: str, protocol: Mapping[str, Any], legend: str) -> list[str]:

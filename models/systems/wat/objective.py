@@ -201,7 +201,9 @@ def _timing(
         rhythm, sure = network.rhythm.measure(poses, performed)
     log_length = (batch["length"][:, None] / LENGTH_UNIT).log()
     sure = sure[:, None]
-    return torch.cat([log_length, rhythm], 1), torch.cat([1 + 0 * sure, sure, sure, sure], 1)
+    return torch.cat([log_length, rhythm], 1), torch.cat(
+        [torch.ones_like(sure), sure, sure, sure], 1
+    )
 
 
 def _unlikely(
