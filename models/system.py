@@ -125,6 +125,8 @@ class Recipe:
     stages: tuple[Stage, ...] = ()
     schedule: Schedule | None = None
     x_t_shape: tuple[int, ...] = ()
+    eta: float = 0.0
+    """How the bundle samples: 0 by DDIM, 1 by DDPM."""
     trajectory: str = "world"
     symmetries: tuple[str, ...] = ("yaw", "translation")
 

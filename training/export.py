@@ -198,6 +198,7 @@ def _manifest(recipe: Recipe, label: Label, specs: Mapping[str, GraphSpec]) -> M
         fields["schedule"] = ScheduleSpec(
             alpha_bar=tuple(schedule.alpha_bar.tolist()),
             variance=tuple(tuple(row) for row in schedule.variance.tolist()),
+            eta=recipe.eta,
         )
     if data.actions:
         fields["actions"] = ActionsSpec(
@@ -292,19 +293,26 @@ def _denoised(recipe: Recipe, denoiser: Graph, tensors: Mapping[str, Tensor], se
     (first,) = x_first(recipe.x_t_shape, schedule=schedule, seed=seed, sample_indices=(0,))
     x_t = torch.from_numpy(first).expand(rows, *recipe.x_t_shape)
     x0 = x_t
-    for t in timesteps(schedule.num_steps, schedule.num_steps):
+    for step, t in enumerate(timesteps(schedule.num_steps, schedule.num_steps)):
         timestep = torch.full((rows,), t)
         x0 = _run(denoiser, {**tensors, "x_t": x_t, "timestep": timestep})["x0"]
-        following = (schedule.alpha_bar[t - 1], schedule.variance[t - 1]) if t else (1.0, [0.0])
+        (drawn,) = noise(recipe.x_t_shape, seed=seed, sample_indices=(0,), draw=step + 1)
         x_t = ddim_step(
             x_t=x_t,
             x0=x0,
             alpha_bar=float(schedule.alpha_bar[t]),
-            variance=torch.tensor(schedule.variance[t], dtype=torch.float32),
-            alpha_bar_next=float(following[0]),
-            variance_next=torch.tensor(following[1], dtype=torch.float32),
+            variance=_along_rows(schedule.variance[t], x_t),
+            alpha_bar_next=float(schedule.alpha_bar[t - 1]) if t else 1.0,
+            variance_next=_along_rows(schedule.variance[t - 1] * (t > 0), x_t),
+            eta=recipe.eta,
+            noise=torch.from_numpy(drawn),
         )
     return x0
+
+
+def _along_rows(values: Float[np.ndarray, "N"], x_t: Tensor) -> Tensor:
+    """Values of the schedule's directions, which lie along the first axis of every row."""
+    return torch.tensor(values, dtype=torch.float32).reshape(-1, *[1] * (x_t.ndim - 2))
 
 
 def _check_parity(

@@ -41,12 +41,20 @@ def apd(samples: Samples) -> PerItem:
 
     0 for a single sample (Yuan and Kitani 2020).
     """
+    return mean_over_pairs(sample_distances(samples))
+
+
+def sample_distances(samples: Samples) -> Float[np.ndarray, "B S S"]:
+    """Distance in metres of every two samples, each a whole sequence as one vector."""
     sequences = _root_relative(samples).reshape(len(samples), samples.shape[1], -1)
-    count = sequences.shape[1]
-    total = np.zeros(len(samples))
-    for i in range(count - 1):  # one sample against the later ones: no array of all pairs
-        total += np.linalg.norm(sequences[:, i + 1 :] - sequences[:, i, None], axis=-1).sum(axis=-1)
-    return total / max(count * (count - 1) / 2, 1)
+    rows = (sequences - sequences[:, i, None] for i in range(sequences.shape[1]))
+    return np.stack([np.linalg.norm(row, axis=-1) for row in rows], axis=1)
+
+
+def mean_over_pairs(distances: Float[np.ndarray, "B S S"]) -> PerItem:
+    """Mean over the pairs of different samples; 0 where there is none."""
+    count = distances.shape[1]
+    return np.asarray(distances.sum(axis=(1, 2)) / max(count * (count - 1), 1))
 
 
 def multimodal_groups(
@@ -121,23 +129,68 @@ def root_free_limbs(parents: Sequence[int]) -> Limbs:
 
 
 def limb_stretch(samples: Samples, future: Futures, limbs: Limbs) -> tuple[PerItem, PerItem]:
-    """Mean and RMSE, in % of the real length, of how far limbs differ from it.
+    """Mean and RMSE over the frames, in % of the real length, of how far limbs differ from it.
 
-    The mean is of each sample's mean length, the RMSE of every frame's.
+    As the paper defines them (Curreli et al. 2025, eq. 13).
     """
     lengths, real = _limb_lengths(samples, future, limbs)
-    mean = np.abs(lengths.mean(axis=2) - real) / real
-    rmse = np.sqrt(np.square(lengths - real[:, :, None]).mean(axis=2)) / real
-    return _percent(mean), _percent(rmse)
+    error = np.abs(lengths - real[:, :, None]) / real[:, :, None]
+    return _percent(error.mean(axis=2)), _percent(np.sqrt(np.square(error).mean(axis=2)))
+
+
+def mean_length_error(samples: Samples, future: Futures, limbs: Limbs) -> PerItem:
+    """How far the mean length of each sample's limbs differs from the real one, in % of it.
+
+    What the authors' published code calls the mean stretch; it does not see a limb that swings
+    about its length.
+    """
+    lengths, real = _limb_lengths(samples, future, limbs)
+    return _percent(np.abs(lengths.mean(axis=2) - real) / real)
 
 
 def limb_jitter(samples: Samples, future: Futures, limbs: Limbs) -> tuple[PerItem, PerItem]:
-    """Mean and RMSE, in % of the real length, of how much limbs change from frame to frame."""
+    """Mean and RMSE, in % of the real length, of how much limbs change from frame to frame.
+
+    Paper (Curreli et al. 2025, eq. 13) and published code agree on these.
+    """
     lengths, real = _limb_lengths(samples, future, limbs)
     change = np.diff(lengths, axis=2)
     mean = np.abs(change).mean(axis=2) / real
     rmse = np.sqrt(np.square(change).mean(axis=2)) / real
     return _percent(mean), _percent(rmse)
+
+
+def worst_limb_errors(
+    samples: Samples, future: Futures, limbs: Limbs
+) -> tuple[Float[np.ndarray, "B S"], Float[np.ndarray, "B S"]]:
+    """The largest stretch and the largest jitter of each sample, in % of the real length."""
+    lengths, real = _limb_lengths(samples, future, limbs)
+    stretch = np.abs(lengths - real[:, :, None]) / real[:, :, None]
+    jitter = np.abs(np.diff(lengths, axis=2)) / real[:, :, None]
+    return 100 * stretch.max(axis=(2, 3)), 100 * jitter.max(axis=(2, 3))
+
+
+def valid_share(worst: Float[np.ndarray, "B S"], tolerance: float) -> PerItem:
+    """Share of an item's samples whose largest error is below the tolerance (ibid., Fig. 7)."""
+    return np.asarray((worst < tolerance).mean(axis=1))
+
+
+def valid_apd(
+    distances: Float[np.ndarray, "B S S"], worst: Float[np.ndarray, "B S"], tolerance: float
+) -> PerItem:
+    """`apd` among the samples whose largest error is below the tolerance (ibid., Fig. 8).
+
+    0 where fewer than two are.
+
+    Args:
+        distances: `sample_distances`.
+        worst: one of `worst_limb_errors`.
+        tolerance: in the same %.
+    """
+    valid = worst < tolerance
+    count = valid.sum(axis=1)
+    total = (distances * valid[:, :, None] * valid[:, None]).sum(axis=(1, 2))
+    return np.asarray(total / np.maximum(count * (count - 1), 1))
 
 
 def first_frame_jump(samples: Samples, observation: Float[np.ndarray, "B T J 3"]) -> PerItem:

@@ -26,14 +26,37 @@ COLUMNS: tuple[tuple[str, str], ...] = (  # heading, how a row shows it
     ("velocity change, x real", "{velocity_change:.2f}"),
     ("trained on", "{trained_on}"),
 )
+STRETCH_TOLERANCES = (0.5, 1.0, 2.5, 5.0, 10.0, 20.0)
+JITTER_TOLERANCES = (0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
+
+
+def _at(score: str, tolerance: float) -> str:
+    """The key of a score at a tolerance; a format string takes a dot for an attribute."""
+    return f"{score}_{tolerance:g}".replace(".", "_")
+
+
+REALISM_COLUMNS: tuple[tuple[str, str], ...] = (
+    ("predictor", "{name}"),
+    ("stretch % (RMSE)", "{stretch:.2f} ({stretch_rmse:.2f})"),
+    ("mean length off, %", "{mean_length_error:.2f}"),
+    ("jitter % (RMSE)", "{jitter:.3f} ({jitter_rmse:.3f})"),
+    *((f"valid at {t:g} %", f"{{{_at('valid', t)}:.0%}}") for t in STRETCH_TOLERANCES),
+    *((f"APD at {t:g} %", f"{{{_at('valid_apd', t)}:.0%}}") for t in JITTER_TOLERANCES),
+)
 ERRORS = ("ade", "fde", "world_ade", "world_fde")
 
 LEGEND = """\
 In brackets after an error: its ratio to zero velocity. ADE and FDE in metres, best of the samples,
 a pose as one vector: relative to the root without it, or all joints in the world. APD in metres.
 CMD with the action as class, its mean motion being that of the real futures here. Stretch and
-jitter in % over all bones. Jump and velocity change at the first predicted frame: times the real
-ones. Trained on: share of these windows that the bundle's training data hold."""
+jitter in % over all bones, by eq. 13 of Curreli et al. (2025). Jump and velocity change at the
+first predicted frame: times the real ones. Trained on: share of these windows that the bundle's
+training data hold."""
+REALISM_LEGEND = """\
+Body realism (Curreli et al. 2025, Figs. 7 and 8). Mean length off: what the authors' published
+code calls mean stretch. Valid at t: share of futures of which no bone in any frame is stretched by
+t. APD at t: APD among the futures of which no bone changes by t from frame to frame, as a share of
+all the futures' APD."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -81,6 +104,9 @@ class Evaluation(Report[Row]):
             mine = [row for row in self.rows if (row.group, row.bone_lengths) == (group, bones)]
             lines += ["", f"### {group}, {mine[0].windows} windows, bone lengths {bones}", ""]
             lines += table(COLUMNS, (row.values() for row in mine))
+            if bones == "free":
+                lines += ["", REALISM_LEGEND, ""]
+                lines += table(REALISM_COLUMNS, (row.values() for row in mine))
         return "\n".join(lines) + "\n"
 
 
@@ -101,18 +127,29 @@ class Scorer:
         answer = samples[None]
         stretch, stretch_rmse = metrics.limb_stretch(answer, future, self._limbs)
         jitter, jitter_rmse = metrics.limb_jitter(answer, future, self._limbs)
+        worst_stretch, worst_jitter = metrics.worst_limb_errors(answer, future, self._limbs)
+        distances = metrics.sample_distances(answer)
         values = {
             "ade": metrics.ade(answer, future),
             "fde": metrics.fde(answer, future),
             "world_ade": metrics.world_ade(answer, future),
             "world_fde": metrics.world_fde(answer, future),
-            "apd": metrics.apd(answer),
+            "apd": metrics.mean_over_pairs(distances),
+            "mean_length_error": metrics.mean_length_error(answer, future, self._limbs),
             "stretch": stretch,
             "stretch_rmse": stretch_rmse,
             "jitter": jitter,
             "jitter_rmse": jitter_rmse,
             "jump": metrics.first_frame_jump(answer, observation),
             "velocity_change": metrics.velocity_change(answer, observation),
+            **{
+                _at("valid", tolerance): metrics.valid_share(worst_stretch, tolerance)
+                for tolerance in STRETCH_TOLERANCES
+            },
+            **{
+                _at("valid_apd", tolerance): metrics.valid_apd(distances, worst_jitter, tolerance)
+                for tolerance in JITTER_TOLERANCES
+            },
         }
         self._items.append({key: float(value[0]) for key, value in values.items()})
         self._motion.append(metrics.motion_per_frame(answer)[0])
@@ -127,6 +164,8 @@ class Scorer:
         means["jump"] /= float(real_jump)
         means["velocity_change"] /= float(real_change)
         classes = metrics.class_means(metrics.motion_per_frame(real), windows.classes)
+        for tolerance in JITTER_TOLERANCES:
+            means[_at("valid_apd", tolerance)] /= max(means["apd"], 1e-12)
         means["cmd"] = metrics.cmd(np.stack(self._motion), windows.classes, classes)
         return means
 

@@ -16,14 +16,19 @@ from training.metrics import (
     first_frame_jump,
     limb_jitter,
     limb_stretch,
+    mean_length_error,
     mmade,
     mmfde,
     motion_per_frame,
     multimodal_groups,
     root_free_limbs,
+    sample_distances,
+    valid_apd,
+    valid_share,
     velocity_change,
     world_ade,
     world_fde,
+    worst_limb_errors,
 )
 
 
@@ -162,9 +167,37 @@ def test_limbs_that_swing_by_ten_percent_jitter_by_twenty_around_their_length():
     swing = np.array([1.1, 0.9] * 3)[None, None, :, None, None]
     limbs = bones((-1, 0, 1, 2, 0))
     mean, rmse = limb_stretch(swing * future[:, None], future, limbs)
-    np.testing.assert_allclose([mean, rmse], [[0.0], [10.0]], atol=1e-12)
+    np.testing.assert_allclose([mean, rmse], [[10.0], [10.0]])
+    error = mean_length_error(swing * future[:, None], future, limbs)
+    np.testing.assert_allclose(error, 0.0, atol=1e-12)
     for values in limb_jitter(swing * future[:, None], future, limbs):
         np.testing.assert_allclose(values, 20.0)
+
+
+def one_limb(*lengths: float) -> np.ndarray:
+    """A sample (1, 1, H, 2, 3) of one limb with these lengths."""
+    sample = np.zeros((1, 1, len(lengths), 2, 3))
+    sample[0, 0, :, 1, 2] = lengths
+    return sample
+
+
+def test_worst_errors_are_those_of_the_worst_frame():
+    future = one_limb(1.0, 1.0, 1.0)[:, 0]
+    samples = np.concatenate([one_limb(1.0, 1.0, 1.0), one_limb(1.0, 1.02, 0.97)], axis=1)
+    stretch, jitter = worst_limb_errors(samples, future, bones((-1, 0)))
+    np.testing.assert_allclose(stretch, [[0.0, 3.0]], atol=1e-9)
+    np.testing.assert_allclose(jitter, [[0.0, 5.0]], atol=1e-9)
+    np.testing.assert_array_equal(valid_share(stretch, 2.0), [0.5])
+    np.testing.assert_array_equal(valid_share(stretch, 4.0), [1.0])
+
+
+def test_apd_of_valid_samples_leaves_the_others_out():
+    samples = random_poses(2, 5, 3)
+    distances = sample_distances(samples)
+    worst = np.array([[0.0, 9.0, 0.0, 0.0, 9.0], [9.0, 9.0, 9.0, 9.0, 0.0]])
+    kept = samples[:1, [0, 2, 3]]
+    np.testing.assert_allclose(valid_apd(distances, worst, 1.0), [apd(kept)[0], 0.0])
+    np.testing.assert_allclose(valid_apd(distances, worst, 10.0), apd(samples))
 
 
 def test_joints_that_sit_on_their_parent_are_no_limbs():

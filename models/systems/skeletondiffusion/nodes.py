@@ -1,0 +1,230 @@
+"""Motion as sequences on the nodes of a skeleton's graph, and back: two representations.
+
+Both cut a motion into ticks, the time steps of the recurrent networks, and say what a decoder must
+know of the observation (``start``: one row of numbers per node).
+"""
+
+import functools
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from models.motion.skeleton import Skeleton
+from models.pose import Frame, facing
+from models.systems.skeletondiffusion.noise import NodeGraph, with_root, without_root
+
+MOVES_BY = 3.0
+"""What was moved in half a second counts this much more than where it is."""
+
+LAST, BEFORE, VELOCITY, LENGTH = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 10)
+"""What `LimbNodes.start` says of a limb."""
+
+
+class RootRelativeNodes(nn.Module):
+    """The paper's: joints relative to the dropped root, a frame per tick, in a box of metres."""
+
+    start_width = 6
+    inputs_per_tick = 3
+    outputs_per_tick = 3
+
+    def __init__(
+        self, skeleton: Skeleton, *, num_observed: int, horizon: int, box_m: float
+    ) -> None:
+        super().__init__()
+        self.graph: NodeGraph = without_root(skeleton)
+        self.box_m = box_m
+        self.num_ticks = horizon
+        self.decoder_ticks = horizon
+        self.observed_width = 3 * num_observed
+
+    def _nodes(self, poses: Float[Tensor, "B L J 3"]) -> Float[Tensor, "N B L 3"]:
+        return (poses[:, :, 1:] - poses[:, :, :1]).permute(2, 0, 1, 3) / self.box_m
+
+    def start(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "N B S"]:
+        """The last two poses."""
+        return self._nodes(observation[:, -2:]).flatten(2)
+
+    def observed(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "N B T 3"]:
+        """The ticks of the observation."""
+        return self._nodes(observation)
+
+    def future(
+        self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B H J 3"]
+    ) -> Float[Tensor, "N B H 3"]:
+        """The ticks of the future."""
+        del observation
+        return self._nodes(poses)
+
+    def target(
+        self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B H J 3"]
+    ) -> Float[Tensor, "N B H 3"]:
+        """What `motion` should be, metres."""
+        del observation
+        return self._nodes(poses) * self.box_m
+
+    def motion(
+        self, outputs: Float[Tensor, "N B H 3"], start: Float[Tensor, "N B S"], *, every: int = 1
+    ) -> Float[Tensor, "N B frames 3"]:
+        """Joints relative to the root, metres, from a decoder's outputs; absolute, in the box.
+
+        Args:
+            outputs: of the decoder, tick by tick.
+            start: what it started from.
+            every: 2 gives every second frame, up to the last.
+        """
+        del start
+        return torch.tanh(outputs[:, :, every - 1 :: every]) * self.box_m
+
+    def leave(
+        self, observation: Float[Tensor, "B T J 3"], motion: Float[Tensor, "N B H 3"]
+    ) -> Float[Tensor, "B H J 3"]:
+        """Poses around the last observed root."""
+        root = observation[:, -1:, :1]
+        joints = motion.permute(1, 2, 0, 3) + root
+        return torch.cat([root.expand(-1, joints.shape[1], -1, -1), joints], dim=2)
+
+
+class LimbNodes(nn.Module):
+    """Ours: every joint but the root as its limb, the root as its path, in the canonical frame.
+
+    A future is a cubic B-spline that leaves the last observed pose with the observed velocity;
+    limbs are turned, never stretched: each keeps its mean observed length.
+    """
+
+    start_width = 10
+    spline: Tensor
+    glide: Tensor
+    scale: Tensor
+    to_joints: Tensor
+
+    def __init__(  # noqa: PLR0913 - the sizes of the representation
+        self,
+        skeleton: Skeleton,
+        *,
+        num_observed: int,
+        horizon: int,
+        frames_per_tick: int,
+        knot_frames: int,
+        knots_per_tick: int,
+        root_weight: float,
+    ) -> None:
+        super().__init__()
+        self.graph: NodeGraph = with_root(skeleton)
+        self.frames_per_tick = frames_per_tick
+        self.num_ticks = horizon // frames_per_tick
+        self.inputs_per_tick = 3 * frames_per_tick
+        spline, glide = continuing_spline(horizon, knot_frames)
+        self.decoder_ticks = -(-spline.shape[1] // knots_per_tick)
+        self.outputs_per_tick = 3 * knots_per_tick
+        self.observed_width = 3 * num_observed
+        self.register_buffer("spline", spline, persistent=False)
+        self.register_buffer("glide", glide, persistent=False)
+        self.register_buffer("scale", torch.ones(skeleton.num_joints))
+        self.register_buffer("to_joints", _chains(skeleton), persistent=False)
+        self.root_weight = root_weight
+        self._pairs = facing(skeleton)
+        self._parents = list(skeleton.parents[1:])
+
+    def _limbs(
+        self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B L J 3"]
+    ) -> Float[Tensor, "N B L 3"]:
+        canonical = Frame(observation, self._pairs).enter(poses).permute(2, 0, 1, 3)
+        return torch.cat([canonical[:1], canonical[1:] - canonical[self._parents]])
+
+    def start(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "N B S"]:
+        """The last limbs and those before, their velocity in metres a frame, their lengths."""
+        limbs = self._limbs(observation, observation)
+        velocity = (limbs[:, :, -1] - limbs[:, :, -3]) / 2
+        lengths = limbs.square().sum(dim=3).add(1e-12).sqrt()
+        # Term by term: onnxruntime's sums round differently in vectors and in what is left over.
+        frames = lengths.unbind(dim=2)
+        mean = functools.reduce(torch.add, frames) / len(frames)
+        return torch.cat([limbs[:, :, -1], limbs[:, :, -2], velocity, mean[:, :, None]], dim=2)
+
+    def observed(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "N B T 3"]:
+        """The frames of the observation, relative to the last, in whose place it stands itself."""
+        limbs = self._limbs(observation, observation)
+        relative = (limbs[:, :, :-1] - limbs[:, :, -1:]) * MOVES_BY
+        return torch.cat([relative, limbs[:, :, -1:]], dim=2) / self.scale[:, None, None, None]
+
+    def future(
+        self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B H J 3"]
+    ) -> Float[Tensor, "N B K F"]:
+        """The ticks of the future, relative to the last observed pose."""
+        last = self._limbs(observation, observation[:, -1:])
+        relative = (self._limbs(observation, poses) - last) / self.scale[:, None, None, None]
+        return relative.unflatten(2, (-1, self.frames_per_tick)).flatten(3)
+
+    def target(
+        self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B H J 3"]
+    ) -> Float[Tensor, "N B H 3"]:
+        """What `motion` should be."""
+        return self._weighted(self._limbs(observation, poses))
+
+    def motion(
+        self, outputs: Float[Tensor, "N B K O"], start: Float[Tensor, "N B S"], *, every: int = 1
+    ) -> Float[Tensor, "N B frames 3"]:
+        """Joints relative to the root and the root's weighted path, from a decoder's outputs.
+
+        Args:
+            outputs: the spline's control points, tick by tick.
+            start: what the decoder started from.
+            every: 2 gives every second frame, up to the last.
+        """
+        return self._weighted(self._turned_limbs(outputs, start, every))
+
+    def _weighted(self, limbs: Float[Tensor, "N B H 3"]) -> Float[Tensor, "N B H 3"]:
+        joints = torch.matmul(self.to_joints, limbs.flatten(1)).unflatten(1, (-1, *limbs.shape[2:]))
+        return torch.cat([limbs[:1] * self.root_weight, joints])
+
+    def _turned_limbs(
+        self, outputs: Float[Tensor, "N B K O"], start: Float[Tensor, "N B S"], every: int
+    ) -> Float[Tensor, "N B H 3"]:
+        points = outputs.unflatten(3, (-1, 3)).flatten(2, 3)[:, :, : self.spline.shape[1]]
+        spline, glide = self.spline[every - 1 :: every], self.glide[every - 1 :: every]
+        moved = torch.matmul(spline, points * self.scale[:, None, None, None])
+        moved = moved + glide * start[:, :, None, VELOCITY] + start[:, :, None, LAST]
+        squared = moved[1:].square().sum(dim=3, keepdim=True)
+        turned = moved[1:] * (start[1:, :, None, LENGTH] * (squared + 1e-8).rsqrt())
+        return torch.cat([moved[:1], turned])
+
+    def leave(
+        self, observation: Float[Tensor, "B T J 3"], motion: Float[Tensor, "N B H 3"]
+    ) -> Float[Tensor, "B H J 3"]:
+        """Poses in the world of the observation."""
+        root = motion[:1] / self.root_weight
+        canonical = torch.cat([root, motion[1:] + root]).permute(1, 2, 0, 3)
+        return Frame(observation, self._pairs).leave(canonical)
+
+
+def continuing_spline(
+    horizon: int, knot_frames: int
+) -> tuple[Float[Tensor, "horizon P"], Float[Tensor, "horizon 1"]]:
+    """A uniform cubic B-spline over the frames 1 ... horizon that is 0 at frame 0.
+
+    Returns:
+        What each free control point adds, and what a velocity at frame 0 of one a frame adds: of
+        the control points -1 to n, the first two follow from value and velocity at frame 0.
+    """
+    segments = -(-horizon // knot_frames)
+    frame = torch.arange(1, horizon + 1, dtype=torch.float64) / knot_frames
+    away = (frame[:, None] - torch.arange(-1, segments + 2, dtype=torch.float64)).abs()
+    near = 2 / 3 - away.square() + away**3 / 2
+    far = (2 - away).clamp(min=0) ** 3 / 6
+    basis = torch.where(away < 1, near, far)  # (horizon, n + 2), points -1 ... n + 1
+    before, at, after = basis[:, 0], basis[:, 1], basis[:, 2:]
+    # value: (c_-1 + 4 c_0 + c_1) / 6 = 0; velocity: (c_1 - c_-1) / (2 h) = v.
+    spline = after.clone()
+    spline[:, 0] += before - at / 2
+    glide = knot_frames * (at / 2 - 2 * before)
+    return spline.float(), glide[:, None].float()
+
+
+def _chains(skeleton: Skeleton) -> Float[Tensor, "limbs J"]:
+    """1 where a limb lies on the way from the root to a joint, root left out."""
+    chains = torch.eye(skeleton.num_joints)
+    for joint in range(1, skeleton.num_joints):
+        chains[joint] += chains[skeleton.parents[joint]]
+    chains[:, 0] = 0
+    return chains[1:]
