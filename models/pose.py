@@ -46,8 +46,11 @@ class Frame:
 
     def leave(self, canonical: Float[Tensor, "B L J 3"]) -> Float[Tensor, "B L J 3"]:
         """Poses of the canonical frame in the world."""
+        frames, joints = canonical.shape[1:3]
         turned = torch.matmul(canonical.flatten(1, 2), self.turn.transpose(1, 2))
-        return turned.unflatten(1, canonical.shape[1:3]) + self.origin
+        # Whole poses are added: what runs over three coordinates at a time is slow.
+        origin = self.origin.expand(-1, -1, joints, -1).flatten(1)[:, None]
+        return (turned.reshape(-1, frames, 3 * joints) + origin).unflatten(2, (joints, 3))
 
 
 def continuation_basis(num_bases: int, length: int) -> Float[Tensor, "length num_bases"]:

@@ -14,6 +14,7 @@ from models.system import Data
 from service.engine.engine import Engine
 from service.engine.runner import Runner
 from service.futures import BoneLengths
+from training.contact_sheet import save_small
 from training.data.batches import described_data, training_clips
 from training.data.store import ClipRecord, Store, select
 from training.data.windows import Windows, cut
@@ -26,10 +27,11 @@ from training.predictors import (
     held,
 )
 from training.scores import Evaluation, Row, Scorer, TestWindows
+from training.validity import validity_figure
 
 RETRIEVAL_STRIDE = 2
 REFERENCE = "zero velocity"
-JSON_FILE, TABLE_FILE = "evaluation.json", "evaluation.md"
+JSON_FILE, TABLE_FILE, VALIDITY_FILE = "evaluation.json", "evaluation.md", "validity.png"
 
 
 class EvaluateError(Exception):
@@ -71,13 +73,13 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
     bone_lengths: Sequence[BoneLengths] = ("observed", "free"),
     threads: int = 2,
 ) -> Evaluation:
-    """Score bundles, zero and constant velocity and retrieval; write a JSON and a Markdown table.
+    """Score bundles, zero and constant velocity and retrieval; write JSON, a table and a plot.
 
     Args:
         bundles: folders and manifests, for the store's skeleton, of one observation and horizon.
         store: where windows are cut.
         groups: selectors of clips, by the name of their group.
-        out: folder for the two files.
+        out: folder for the files; the plot is of body realism in the first group.
         command: what was typed; it stands at the head of the table.
         num_samples: futures for each observation; retrieval takes as many neighbours.
         num_steps: denoising steps to run; None runs all.
@@ -135,6 +137,9 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
     out.mkdir(parents=True, exist_ok=True)
     (out / JSON_FILE).write_text(evaluation.json())
     (out / TABLE_FILE).write_text(evaluation.markdown())
+    if "free" in bone_lengths:
+        first = (row for row in rows if row.group == tests[0].name)
+        save_small(validity_figure(first), out / VALIDITY_FILE)
     return evaluation
 
 

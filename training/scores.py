@@ -30,7 +30,7 @@ STRETCH_TOLERANCES = (0.5, 1.0, 2.5, 5.0, 10.0, 20.0)
 JITTER_TOLERANCES = (0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
 
 
-def _at(score: str, tolerance: float) -> str:
+def score_at(score: str, tolerance: float) -> str:
     """The key of a score at a tolerance; a format string takes a dot for an attribute."""
     return f"{score}_{tolerance:g}".replace(".", "_")
 
@@ -40,8 +40,8 @@ REALISM_COLUMNS: tuple[tuple[str, str], ...] = (
     ("stretch % (RMSE)", "{stretch:.2f} ({stretch_rmse:.2f})"),
     ("mean length off, %", "{mean_length_error:.2f}"),
     ("jitter % (RMSE)", "{jitter:.3f} ({jitter_rmse:.3f})"),
-    *((f"valid at {t:g} %", f"{{{_at('valid', t)}:.0%}}") for t in STRETCH_TOLERANCES),
-    *((f"APD at {t:g} %", f"{{{_at('valid_apd', t)}:.0%}}") for t in JITTER_TOLERANCES),
+    *((f"valid at {t:g} %", f"{{{score_at('valid', t)}:.0%}}") for t in STRETCH_TOLERANCES),
+    *((f"APD at {t:g} %", f"{{{score_at('valid_apd', t)}:.0%}}") for t in JITTER_TOLERANCES),
 )
 ERRORS = ("ade", "fde", "world_ade", "world_fde")
 
@@ -143,11 +143,13 @@ class Scorer:
             "jump": metrics.first_frame_jump(answer, observation),
             "velocity_change": metrics.velocity_change(answer, observation),
             **{
-                _at("valid", tolerance): metrics.valid_share(worst_stretch, tolerance)
+                score_at("valid", tolerance): metrics.valid_share(worst_stretch, tolerance)
                 for tolerance in STRETCH_TOLERANCES
             },
             **{
-                _at("valid_apd", tolerance): metrics.valid_apd(distances, worst_jitter, tolerance)
+                score_at("valid_apd", tolerance): metrics.valid_apd(
+                    distances, worst_jitter, tolerance
+                )
                 for tolerance in JITTER_TOLERANCES
             },
         }
@@ -165,7 +167,7 @@ class Scorer:
         means["velocity_change"] /= float(real_change)
         classes = metrics.class_means(metrics.motion_per_frame(real), windows.classes)
         for tolerance in JITTER_TOLERANCES:
-            means[_at("valid_apd", tolerance)] /= max(means["apd"], 1e-12)
+            means[score_at("valid_apd", tolerance)] /= max(means["apd"], 1e-12)
         means["cmd"] = metrics.cmd(np.stack(self._motion), windows.classes, classes)
         return means
 

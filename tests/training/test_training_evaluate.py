@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from people import small_store
+from PIL import Image
 
 from models.bundle import read_manifest
 from models.motion.kinematics import bone_lengths, rotate_yaw
@@ -18,6 +19,7 @@ from training.data.windows import Windows, cut
 from training.evaluate import EvaluateError, evaluate
 from training.predictors import BundlePredictor
 from training.retrieval import nearest_windows, retrieved_futures
+from training.scores import STRETCH_TOLERANCES, score_at
 
 GROUPS = {"old": ("style=old",), "valid": ("split=valid",)}
 
@@ -104,6 +106,21 @@ def test_evaluation_scores_bundles_beside_the_baselines(
     assert table.startswith("`the command`\n")
     assert "### old, 3 windows, bone lengths observed" in table
     assert table == str(evaluation)
+    with Image.open(tmp_path / "validity.png") as plot:
+        assert plot.size[0] > 500
+
+
+def test_evaluation_shows_how_many_futures_are_valid(store: Store, bundles: Path, tmp_path: Path):
+    chosen = [(bundles / "diffusion", read_manifest(bundles / "diffusion"))]
+    evaluation = evaluate(
+        chosen, store, GROUPS, out=tmp_path, num_samples=4, max_windows=3, bone_lengths=("free",)
+    )
+    (row,) = (row for row in evaluation.rows if (row.name, row.group) == ("diffusion", "old"))
+    shares = [row.scores[score_at("valid", tolerance)] for tolerance in STRETCH_TOLERANCES]
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] <= shares[-1] <= 1
+    assert shares[0] < 1  # the tiny network stretches limbs
+    assert "valid at 2.5 %" in str(evaluation)
 
 
 def test_evaluation_is_the_same_every_time(store: Store, bundles: Path, tmp_path: Path):

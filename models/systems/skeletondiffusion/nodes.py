@@ -14,6 +14,7 @@ from models.motion.skeleton import Skeleton
 from models.pose import Frame, facing
 from models.systems.skeletondiffusion.noise import NodeGraph, with_root, without_root
 
+SHORTEST_SQUARED = 1e-8
 MOVES_BY = 3.0
 """What was moved in half a second counts this much more than where it is."""
 
@@ -58,14 +59,14 @@ class RootRelativeNodes(nn.Module):
 
     def target(
         self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B H J 3"]
-    ) -> Float[Tensor, "N B H 3"]:
-        """What `motion` should be, metres."""
+    ) -> Float[Tensor, "B H F"]:
+        """What `motion` should be."""
         del observation
-        return self._nodes(poses) * self.box_m
+        return (poses[:, :, 1:] - poses[:, :, :1]).flatten(2)
 
     def motion(
         self, outputs: Float[Tensor, "N B H 3"], start: Float[Tensor, "N B S"], *, every: int = 1
-    ) -> Float[Tensor, "N B frames 3"]:
+    ) -> Float[Tensor, "B frames F"]:
         """Joints relative to the root, metres, from a decoder's outputs; absolute, in the box.
 
         Args:
@@ -74,14 +75,19 @@ class RootRelativeNodes(nn.Module):
             every: 2 gives every second frame, up to the last.
         """
         del start
-        return torch.tanh(outputs[:, :, every - 1 :: every]) * self.box_m
+        chosen = outputs[:, :, every - 1 :: every].permute(1, 2, 0, 3).flatten(2)
+        return torch.tanh(chosen) * self.box_m
+
+    def weigh(self, difference: Float[Tensor, "*B F"]) -> Float[Tensor, "*B F"]:
+        """A difference of motions as it counts: every joint alike."""
+        return difference
 
     def leave(
-        self, observation: Float[Tensor, "B T J 3"], motion: Float[Tensor, "N B H 3"]
+        self, observation: Float[Tensor, "B T J 3"], motion: Float[Tensor, "B H F"]
     ) -> Float[Tensor, "B H J 3"]:
         """Poses around the last observed root."""
         root = observation[:, -1:, :1]
-        joints = motion.permute(1, 2, 0, 3) + root
+        joints = motion.unflatten(2, (-1, 3)) + root
         return torch.cat([root.expand(-1, joints.shape[1], -1, -1), joints], dim=2)
 
 
@@ -96,7 +102,11 @@ class LimbNodes(nn.Module):
     spline: Tensor
     glide: Tensor
     scale: Tensor
+    basis: Tensor
+    of_one_limb: Tensor
     to_joints: Tensor
+    weights: Tensor
+    root: Tensor
 
     def __init__(  # noqa: PLR0913 - the sizes of the representation
         self,
@@ -121,8 +131,14 @@ class LimbNodes(nn.Module):
         self.register_buffer("spline", spline, persistent=False)
         self.register_buffer("glide", glide, persistent=False)
         self.register_buffer("scale", torch.ones(skeleton.num_joints))
-        self.register_buffer("to_joints", _chains(skeleton), persistent=False)
-        self.root_weight = root_weight
+        held = torch.cat([spline, glide, torch.ones_like(glide)], dim=1)
+        self.register_buffer("basis", held, persistent=False)
+        joints, xyz = torch.eye(skeleton.num_joints), torch.ones(3, 3)
+        self.register_buffer("of_one_limb", torch.kron(joints, xyz), persistent=False)
+        self.register_buffer("to_joints", _per_axis(_chains(skeleton)), persistent=False)
+        self.register_buffer("weights", _per_axis(_weights(joints, root_weight)), persistent=False)
+        is_root = torch.arange(self.of_one_limb.shape[0]) < 3
+        self.register_buffer("root", is_root.float(), persistent=False)
         self._pairs = facing(skeleton)
         self._parents = list(skeleton.parents[1:])
 
@@ -158,44 +174,43 @@ class LimbNodes(nn.Module):
 
     def target(
         self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B H J 3"]
-    ) -> Float[Tensor, "N B H 3"]:
+    ) -> Float[Tensor, "B H F"]:
         """What `motion` should be."""
-        return self._weighted(self._limbs(observation, poses))
+        return Frame(observation, self._pairs).enter(poses).flatten(2)
 
     def motion(
         self, outputs: Float[Tensor, "N B K O"], start: Float[Tensor, "N B S"], *, every: int = 1
-    ) -> Float[Tensor, "N B frames 3"]:
-        """Joints relative to the root and the root's weighted path, from a decoder's outputs.
+    ) -> Float[Tensor, "B frames F"]:
+        """Joints in the canonical frame from a decoder's outputs.
 
         Args:
             outputs: the spline's control points, tick by tick.
             start: what the decoder started from.
             every: 2 gives every second frame, up to the last.
         """
-        return self._weighted(self._turned_limbs(outputs, start, every))
+        # Products of matrices throughout: what runs over three coordinates at a time is slow.
+        points = outputs.flatten(2).unflatten(2, (-1, 3)) * self.scale[:, None, None, None]
+        free = points[:, :, : self.spline.shape[1]].permute(1, 2, 0, 3).flatten(2)
+        last, velocity, length = (
+            start[:, :, part].transpose(0, 1) for part in (LAST, VELOCITY, LENGTH)
+        )
+        given = torch.stack([velocity.flatten(1), last.flatten(1)], dim=1)
+        moved = torch.matmul(self.basis[every - 1 :: every], torch.cat([free, given], dim=1))
+        squared = torch.matmul(moved * moved, self.of_one_limb)
+        lengths = length.expand(-1, -1, 3).flatten(1)[:, None]
+        turned = moved * (lengths * (squared + SHORTEST_SQUARED).rsqrt())
+        limbs = torch.where(self.root > 0, moved, turned)
+        return torch.matmul(limbs, self.to_joints)
 
-    def _weighted(self, limbs: Float[Tensor, "N B H 3"]) -> Float[Tensor, "N B H 3"]:
-        joints = torch.matmul(self.to_joints, limbs.flatten(1)).unflatten(1, (-1, *limbs.shape[2:]))
-        return torch.cat([limbs[:1] * self.root_weight, joints])
-
-    def _turned_limbs(
-        self, outputs: Float[Tensor, "N B K O"], start: Float[Tensor, "N B S"], every: int
-    ) -> Float[Tensor, "N B H 3"]:
-        points = outputs.unflatten(3, (-1, 3)).flatten(2, 3)[:, :, : self.spline.shape[1]]
-        spline, glide = self.spline[every - 1 :: every], self.glide[every - 1 :: every]
-        moved = torch.matmul(spline, points * self.scale[:, None, None, None])
-        moved = moved + glide * start[:, :, None, VELOCITY] + start[:, :, None, LAST]
-        squared = moved[1:].square().sum(dim=3, keepdim=True)
-        turned = moved[1:] * (start[1:, :, None, LENGTH] * (squared + 1e-8).rsqrt())
-        return torch.cat([moved[:1], turned])
+    def weigh(self, difference: Float[Tensor, "*B F"]) -> Float[Tensor, "*B F"]:
+        """A difference of motions as it counts: joints relative to the root, the root by weight."""
+        return torch.matmul(difference, self.weights)
 
     def leave(
-        self, observation: Float[Tensor, "B T J 3"], motion: Float[Tensor, "N B H 3"]
+        self, observation: Float[Tensor, "B T J 3"], motion: Float[Tensor, "B H F"]
     ) -> Float[Tensor, "B H J 3"]:
         """Poses in the world of the observation."""
-        root = motion[:1] / self.root_weight
-        canonical = torch.cat([root, motion[1:] + root]).permute(1, 2, 0, 3)
-        return Frame(observation, self._pairs).leave(canonical)
+        return Frame(observation, self._pairs).leave(motion.unflatten(2, (-1, 3)))
 
 
 def continuing_spline(
@@ -221,10 +236,21 @@ def continuing_spline(
     return spline.float(), glide[:, None].float()
 
 
-def _chains(skeleton: Skeleton) -> Float[Tensor, "limbs J"]:
-    """1 where a limb lies on the way from the root to a joint, root left out."""
+def _chains(skeleton: Skeleton) -> Float[Tensor, "J J"]:
+    """1 where a limb (row) lies on the way from the root to a joint (column)."""
     chains = torch.eye(skeleton.num_joints)
     for joint in range(1, skeleton.num_joints):
-        chains[joint] += chains[skeleton.parents[joint]]
-    chains[:, 0] = 0
-    return chains[1:]
+        chains[:, joint] += chains[:, skeleton.parents[joint]]
+    return chains
+
+
+def _weights(joints: Float[Tensor, "J J"], root_weight: float) -> Float[Tensor, "J J"]:
+    weights = joints.clone()
+    weights[0, 1:] = -1
+    weights[0, 0] = root_weight
+    return weights
+
+
+def _per_axis(matrix: Float[Tensor, "J J"]) -> Float[Tensor, "F F"]:
+    """The same for each of the three coordinates."""
+    return torch.kron(matrix, torch.eye(3))

@@ -67,7 +67,7 @@ class SkeletonDiffusion(nn.Module):
 
     def motion(
         self, x0: Float[Tensor, "N B L"], start: Float[Tensor, "N B S"], *, every: int = 1
-    ) -> Float[Tensor, "N B frames 3"]:
+    ) -> Float[Tensor, "B frames F"]:
         """What a latent in the denoiser's range is decoded to, every so many frames."""
         outputs = self.decoder(x0 * self.latent_scale, start, self.nodes.decoder_ticks)
         return self.nodes.motion(outputs, start, every=every)
@@ -81,10 +81,9 @@ class SkeletonDiffusion(nn.Module):
         return mixed(self.eigenvectors, z)
 
 
-def _distance(difference: Float[Tensor, "N *B H 3"]) -> Float[Tensor, "*B"]:
+def _distance(difference: Float[Tensor, "*B H F"]) -> Float[Tensor, "*B"]:
     """Distance of two motions, poses as vectors, mean over the frames (metres)."""
-    squared = difference.square().sum(dim=(0, -1))
-    return (squared + 1e-8).sqrt().mean(dim=-1)
+    return (difference.square().sum(dim=-1) + 1e-8).sqrt().mean(dim=-1)
 
 
 def _length(progress: float, horizon: int, *, full_at: float, longest_at: float) -> tuple[int, int]:
@@ -127,7 +126,7 @@ def autoencoder_loss(  # noqa: PLR0913 - the settings of the stage
     outputs = nn.functional.pad(outputs, (0, 0, 0, missing))
     frames = ticks * future.shape[1] // nodes.num_ticks
     difference = nodes.motion(outputs, start) - nodes.target(observation, future)
-    error = _distance(difference[:, :, :frames]).mean()
+    error = _distance(nodes.weigh(difference)[:, :frames]).mean()
     return {"total": error, "latent deviation": z.detach().std()}
 
 
@@ -239,7 +238,7 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     losses = {"total": latent, "latent": latent}
     if reconstruction_weight:
         motion = network.motion(x0, start)
-        reconstruction = _distance(motion - target).mean()
+        reconstruction = _distance(network.nodes.weigh(motion - target)).mean()
         losses |= {
             "total": latent + reconstruction_weight * reconstruction,
             "reconstruction": reconstruction,
@@ -253,7 +252,7 @@ def _nearest(
     timestep: Int[Tensor, "B"],
     condition: Float[Tensor, "N B C"],
     start: Float[Tensor, "N B S"],
-    target: Float[Tensor, "N B H 3"],
+    target: Float[Tensor, "B H F"],
 ) -> Int[Tensor, "B"]:
     count = x_t.shape[2]
     x0 = network.denoiser(
@@ -262,6 +261,6 @@ def _nearest(
         condition.repeat_interleave(count, dim=1),
     )
     starts = start.repeat_interleave(count, dim=1)
-    motion = network.motion(x0, starts, every=JUDGED_EVERY).unflatten(1, (-1, count))
-    wanted = target[:, :, JUDGED_EVERY - 1 :: JUDGED_EVERY]
-    return _distance(motion - wanted[:, :, None]).argmin(dim=1)
+    motion = network.motion(x0, starts, every=JUDGED_EVERY).unflatten(0, (-1, count))
+    wanted = target[:, JUDGED_EVERY - 1 :: JUDGED_EVERY]
+    return _distance(network.nodes.weigh(motion - wanted[:, None])).argmin(dim=1)

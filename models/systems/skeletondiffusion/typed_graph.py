@@ -51,7 +51,8 @@ def row_normalised(mixing: Float[Tensor, "N N"]) -> Float[Tensor, "N N"]:
 
 def mixed(mixing: Float[Tensor, "N N"], x: Float[Tensor, "N B C"]) -> Float[Tensor, "N B C"]:
     """G x."""
-    return torch.matmul(mixing, x.flatten(1)).unflatten(1, (-1, x.shape[2]))
+    # Plain numbers: what the exporter traces of a shape, a graph computes at every call.
+    return torch.matmul(mixing, x.flatten(1)).reshape(len(mixing), -1, int(x.shape[2]))
 
 
 class TypedGraphGRU(nn.Module):
@@ -83,12 +84,13 @@ class TypedGraphGRU(nn.Module):
         mixing: Float[Tensor, "N N"],
     ) -> Float[Tensor, "N B H"]:
         """The next state, from what ``self.inputs`` makes of the input."""
-        width = state.shape[2]
+        width = int(state.shape[2])
         of_state = self.state(state)
         gates, new = torch.split(inputs, [2 * width, width], dim=2)
         gates_state, new_state = torch.split(of_state, [2 * width, width], dim=2)
         # The graph is linear: what is added anyway is gathered once.
-        reset, update = torch.sigmoid(mixed(mixing, gates + gates_state)).chunk(2, dim=2)
+        opened = torch.sigmoid(mixed(mixing, gates + gates_state))
+        reset, update = torch.split(opened, width, dim=2)
         candidate = torch.tanh(mixed(mixing, new) + reset * mixed(mixing, new_state))
         return candidate + update * (state - candidate)
 
@@ -108,13 +110,14 @@ class TypedGraphAttention(nn.Module):
     def forward(self, x: Float[Tensor, "N B C"]) -> Float[Tensor, "N B C"]:
         """x and what each node took from the others."""
         normed = x * (x.square().mean(dim=2, keepdim=True) + 1e-6).rsqrt() * self.scale
+        nodes, shape = int(x.shape[0]), (self.heads, self.head_width)
         query, key, value = (
-            part(normed).unflatten(2, (self.heads, self.head_width)).permute(1, 2, 0, 3)
+            part(normed).reshape(nodes, -1, *shape).permute(1, 2, 0, 3)
             for part in self.queries_keys_values
         )
         weights = torch.matmul(query, key.transpose(2, 3)) * self.head_width**-0.5
-        attended = torch.matmul(weights.softmax(dim=3), value).permute(2, 0, 1, 3).flatten(2)
-        result: Tensor = x + self.out(attended)
+        attended = torch.matmul(weights.softmax(dim=3), value).permute(2, 0, 1, 3)
+        result: Tensor = x + self.out(attended.reshape(nodes, -1, self.heads * self.head_width))
         return result
 
 
@@ -145,7 +148,7 @@ class ResidualBlock(nn.Module):
         self, x: Float[Tensor, "N B I"], time: Float[Tensor, "K E"], timestep: Int[Tensor, "B"]
     ) -> Float[Tensor, "N B O"]:
         """The block's features; the table over all K timesteps becomes a constant when exported."""
-        scale, shift = self.film(torch.tanh(time))[timestep].chunk(2, dim=1)
-        inner = self.activation(self.enter(x) * (scale + 1) + shift)
+        scale, shift = self.film(torch.tanh(time)).chunk(2, dim=1)
+        inner = self.activation(self.enter(x) * (scale + 1)[timestep] + shift[timestep])
         result: Tensor = self.skip(x) + self.activation(self.leave(inner))
         return result
