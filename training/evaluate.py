@@ -80,7 +80,7 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
         out: folder for the two files.
         command: what was typed; it stands at the head of the table.
         num_samples: futures for each observation; retrieval takes as many neighbours.
-        num_steps: denoising steps to run; None runs all.
+        num_steps: denoising steps to run; None runs as many as each bundle says.
         seed: of a group's first window; each later one has the next.
         stride: frames between windows of a clip.
         max_windows: windows of a group, evenly spread.
@@ -127,7 +127,7 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
     ]
     protocol = {
         "num_samples": num_samples,
-        "num_steps": num_steps or "all",
+        "num_steps": num_steps or "default",
         "seed": seed,
         **dataclasses.asdict(cutting),
     }

@@ -7,6 +7,7 @@ import tempfile
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +199,8 @@ def _manifest(recipe: Recipe, label: Label, specs: Mapping[str, GraphSpec]) -> M
         fields["schedule"] = ScheduleSpec(
             alpha_bar=tuple(schedule.alpha_bar.tolist()),
             variance=tuple(tuple(row) for row in schedule.variance.tolist()),
+            plan=recipe.plan,
+            default_steps=recipe.default_steps,
         )
     if data.actions:
         fields["actions"] = ActionsSpec(
@@ -292,10 +295,13 @@ def _denoised(recipe: Recipe, denoiser: Graph, tensors: Mapping[str, Tensor], se
     (first,) = x_first(recipe.x_t_shape, schedule=schedule, seed=seed, sample_indices=(0,))
     x_t = torch.from_numpy(first).expand(rows, *recipe.x_t_shape)
     x0 = x_t
-    for t in timesteps(schedule.num_steps, schedule.num_steps):
+    num_steps = recipe.default_steps or schedule.num_steps
+    chain = timesteps(schedule.num_steps, num_steps, plan=recipe.plan)
+    for t, after in zip_longest(chain, chain[1:]):
         timestep = torch.full((rows,), t)
         x0 = _run(denoiser, {**tensors, "x_t": x_t, "timestep": timestep})["x0"]
-        following = (schedule.alpha_bar[t - 1], schedule.variance[t - 1]) if t else (1.0, [0.0])
+        last = after is None
+        following = (1.0, [0.0]) if last else (schedule.alpha_bar[after], schedule.variance[after])
         x_t = ddim_step(
             x_t=x_t,
             x0=x0,
