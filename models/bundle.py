@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from models.diffusion import Schedule
+from models.diffusion import Plan, Schedule, timesteps
 from models.motion.skeleton import Skeleton
 
 FORMAT_VERSION: Literal[1] = 1
@@ -72,11 +72,24 @@ class SkeletonSpec(_Record):
 
 
 class ScheduleSpec(_Record):
-    """Tables of the diffusion process, and how many of its steps run by default."""
+    """Tables of the diffusion process, which steps fewer of them are, and how many run by default.
+
+    ``default_steps`` of None are all.
+    """
 
     alpha_bar: tuple[float, ...] = Field(min_length=1)
     variance: tuple[tuple[float, ...], ...]
     eta: float = Field(default=0.0, ge=0.0, le=1.0)
+    plan: Plan = "stop_early"
+    default_steps: int | None = Field(default=None, gt=0)
+
+    @model_validator(mode="after")
+    def _has_as_many_steps_as_run_by_default(self) -> "ScheduleSpec":
+        if (self.default_steps or 1) > len(self.alpha_bar):
+            raise ValueError(
+                f"default_steps: must be at most {len(self.alpha_bar)}, the timesteps."
+            )
+        return self
 
     def schedule(self) -> Schedule:
         """The tables as arrays."""
@@ -186,15 +199,34 @@ class Manifest(_Record):
 
     @property
     def num_steps(self) -> int:
-        """K, the denoising steps of the whole chain; 1 for a bundle without a denoiser."""
+        """K, the most denoising steps that can be run; 1 for a bundle without a denoiser."""
         return len(self.schedule.alpha_bar) if self.schedule else 1
+
+    @property
+    def default_steps(self) -> int:
+        """The denoising steps that run where nothing else is asked for."""
+        return (self.schedule and self.schedule.default_steps) or self.num_steps
+
+    def timesteps(self, num_steps: int | None) -> tuple[int, ...]:
+        """The timesteps of so many steps, or of the default, by the bundle's own plan."""
+        plan = self.schedule.plan if self.schedule else "stop_early"
+        return timesteps(self.num_steps, num_steps or self.default_steps, plan=plan)
+
+    def chain_steps(self, num_steps: int | None) -> int:
+        """The steps of the chain that so many steps walk along: a stride walks to its end."""
+        if self.schedule and self.schedule.plan == "stride":
+            return num_steps or self.default_steps
+        return self.num_steps
 
     @property
     def digest(self) -> str:
         """Short sha256 over the graphs and the tables: two bundles that answer alike share it."""
-        silent = {"recipe", "training", "description"}
+        silent: dict[str, Any] = dict.fromkeys(("recipe", "training", "description"), True)
+        # Bundles of before there were these keep their digest.
         if self.calibration is None:
-            silent.add("calibration")  # bundles of before there was any keep their digest
+            silent["calibration"] = True
+        if self.schedule and not self.schedule.default_steps and self.schedule.plan == "stop_early":
+            silent["schedule"] = {"plan", "default_steps"}
         body = self.model_dump(mode="json", exclude=silent)
         return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -9,10 +9,13 @@ and ``variance = 1 - alpha_bar`` when the noise is isotropic).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
+
+Plan: TypeAlias = Literal["stop_early", "stride"]
+"""Which timesteps fewer steps take: the noisiest ones, or some evenly spread over the chain."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -71,18 +74,21 @@ def _from_alpha_bar_of(num_steps: int, alpha_bar_of: Callable[[float], float]) -
     return isotropic(np.cumprod(np.asarray(ratios)))
 
 
-def timesteps(num_steps: int, stop_after: int) -> tuple[int, ...]:
-    """Timesteps from the noisiest, num_steps - 1, downwards; the first stop_after of them.
+def timesteps(num_timesteps: int, num_steps: int, *, plan: Plan = "stop_early") -> tuple[int, ...]:
+    """The timesteps of so many steps, from the noisiest, num_timesteps - 1, downwards.
 
-    Stopping early leaves the x0 of the last step that ran as the answer (Barquero et al. 2023,
-    section 4.3).
+    Stopping early takes the first of them all; the x0 of the last step that ran is the answer
+    (Barquero et al. 2023, section 4.3). A stride spreads the steps evenly over the chain, ends of
+    equal parts of it (Lin et al. 2024, table 2, "trailing").
 
     Raises:
-        ValueError: stop_after is not within 1 and num_steps.
+        ValueError: num_steps is not within 1 and num_timesteps.
     """
-    if not 1 <= stop_after <= num_steps:
-        raise ValueError(f"num_steps: found {stop_after}; must be from 1 to {num_steps}.")
-    return tuple(range(num_steps - 1, num_steps - 1 - stop_after, -1))
+    if not 1 <= num_steps <= num_timesteps:
+        raise ValueError(f"num_steps: found {num_steps}; must be from 1 to {num_timesteps}.")
+    if plan == "stride":
+        return tuple(-(-num_timesteps * k // num_steps) - 1 for k in range(num_steps, 0, -1))
+    return tuple(range(num_timesteps - 1, num_timesteps - 1 - num_steps, -1))
 
 
 def q_sample(*, x0: Any, noise: Any, alpha_bar: Any, variance: Any) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Generator, Tensor, nn
 
-from models.diffusion import Schedule
+from models.diffusion import Plan, Schedule
 from models.motion.skeleton import Skeleton
 
 Batch = Mapping[str, Tensor]
@@ -124,6 +124,9 @@ class Recipe:
     graphs: Callable[[Any], tuple[Graph, ...]]
     stages: tuple[Stage, ...] = ()
     schedule: Schedule | None = None
+    plan: Plan = "stop_early"
+    default_steps: int | None = None
+    """Denoising steps that the bundle runs by default; None runs all."""
     x_t_shape: tuple[int, ...] = ()
     eta: float = 0.0
     """How the bundle samples: 0 by DDIM, 1 by DDPM."""

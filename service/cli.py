@@ -87,7 +87,7 @@ def actions() -> None:
 def predict(
     file: Annotated[Path, typer.Argument(help="a motion: .bvh, .amc beside its .asf, or .npz")],
     num_samples: Annotated[int, typer.Option(min=1, help="how many futures")] = 10,
-    num_steps: Annotated[int | None, typer.Option(min=1, help="stop early")] = None,
+    num_steps: Annotated[int | None, typer.Option(min=1, help="denoising steps")] = None,
     deadline_ms: Annotated[
         float | None, typer.Option(help="answer by then with what is ready")
     ] = None,

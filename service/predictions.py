@@ -342,7 +342,7 @@ async def _streamed(
         return event("final", body, media_type) + event("end", b"{}", media_type)
 
     legs = ceil((request.horizon or 1) / answer.manifest.horizon)
-    plan = {"steps": {"of": legs * answer.manifest.num_steps}}
+    plan = {"steps": {"of": legs * answer.manifest.chain_steps(request.num_steps)}}
     events = worker.stream(request, final, preview, request_key=answer.id)
     streams.add(answer)
 

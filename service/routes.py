@@ -133,6 +133,8 @@ def _summary(entry: Entry) -> dict[str, object]:
             "num_observed": manifest.num_observed,
             "horizon": manifest.horizon,
             "num_steps": manifest.num_steps,
+            "default_steps": manifest.default_steps,
+            "step_plan": manifest.schedule.plan if manifest.schedule else None,
             "trajectory": manifest.trajectory,
             "actions": list(manifest.actions.labels) if manifest.actions else [],
         }

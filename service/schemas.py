@@ -117,7 +117,10 @@ class PredictRequest(ObservedMotion):
     model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
 
     num_steps: int | None = Field(
-        default=None, ge=1, description="stop after so many of the model's denoising steps"
+        default=None,
+        ge=1,
+        description="so many of the model's denoising steps: the first, or, as its `step_plan` "
+        "says, an even stride over all; its `default_steps` by default",
     )
     tolerance_m: float | None = Field(
         default=None,
@@ -286,6 +289,8 @@ class ModelSummary(_Body):
     num_observed: int | None = None
     horizon: int | None = None
     num_steps: int | None = None
+    default_steps: int | None = None
+    step_plan: Literal["stop_early", "stride"] | None = None
     trajectory: str | None = None
     actions: list[str] = Field(
         default=[], description="labels; a model that has some answers POST /predict_actions alone"

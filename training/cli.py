@@ -188,7 +188,7 @@ def evaluate_command(
         typer.Option(help="name:selector[,selector…], such as style:style=tired."),
     ],
     num_samples: Annotated[int, typer.Option(help="Futures for each window.")] = 50,
-    num_steps: Annotated[int | None, typer.Option(help="Stop after so many steps.")] = None,
+    num_steps: Annotated[int | None, typer.Option(help="Denoising steps of each.")] = None,
     stride: StrideOption = 10,
     max_windows: Annotated[int, typer.Option(help="Windows of a group at most.")] = 300,
     seed: SeedOption = 0,
@@ -258,7 +258,7 @@ def steps_command(
     rounds: Annotated[int, typer.Option(help="How often each number of steps is timed.")] = 25,
     seed: SeedOption = 0,
 ) -> None:
-    """Measure what stopping after fewer denoising steps costs in quality and saves in time."""
+    """Measure what running fewer denoising steps costs in quality and saves in time."""
     curve = step_curve(
         bundle,
         open_store(store),

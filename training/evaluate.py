@@ -82,7 +82,7 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
         out: folder for the files; the plot is of body realism in the first group.
         command: what was typed; it stands at the head of the table.
         num_samples: futures for each observation; retrieval takes as many neighbours.
-        num_steps: denoising steps to run; None runs all.
+        num_steps: denoising steps to run; None runs as many as each bundle says.
         seed: of a group's first window; each later one has the next.
         stride: frames between windows of a clip.
         max_windows: windows of a group, evenly spread.
@@ -129,7 +129,7 @@ def evaluate(  # noqa: PLR0913  # an evaluation's protocol, spelled out
     ]
     protocol = {
         "num_samples": num_samples,
-        "num_steps": num_steps or "all",
+        "num_steps": num_steps or "default",
         "seed": seed,
         **dataclasses.asdict(cutting),
     }

@@ -7,6 +7,7 @@ import tempfile
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,8 @@ def _manifest(recipe: Recipe, label: Label, specs: Mapping[str, GraphSpec]) -> M
             alpha_bar=tuple(schedule.alpha_bar.tolist()),
             variance=tuple(tuple(row) for row in schedule.variance.tolist()),
             eta=recipe.eta,
+            plan=recipe.plan,
+            default_steps=recipe.default_steps,
         )
     if data.actions:
         fields["actions"] = ActionsSpec(
@@ -293,17 +296,22 @@ def _denoised(recipe: Recipe, denoiser: Graph, tensors: Mapping[str, Tensor], se
     (first,) = x_first(recipe.x_t_shape, schedule=schedule, seed=seed, sample_indices=(0,))
     x_t = torch.from_numpy(first).expand(rows, *recipe.x_t_shape)
     x0 = x_t
-    for step, t in enumerate(timesteps(schedule.num_steps, schedule.num_steps)):
+    num_steps = recipe.default_steps or schedule.num_steps
+    chain = timesteps(schedule.num_steps, num_steps, plan=recipe.plan)
+    for step, (t, after) in enumerate(zip_longest(chain, chain[1:])):
         timestep = torch.full((rows,), t)
         x0 = _run(denoiser, {**tensors, "x_t": x_t, "timestep": timestep})["x0"]
         (drawn,) = noise(recipe.x_t_shape, seed=seed, sample_indices=(0,), draw=step + 1)
+        clean = after is None
         x_t = ddim_step(
             x_t=x_t,
             x0=x0,
             alpha_bar=float(schedule.alpha_bar[t]),
             variance=_along_rows(schedule.variance[t], x_t),
-            alpha_bar_next=float(schedule.alpha_bar[t - 1]) if t else 1.0,
-            variance_next=_along_rows(schedule.variance[t - 1] * (t > 0), x_t),
+            alpha_bar_next=1.0 if clean else float(schedule.alpha_bar[after]),
+            variance_next=_along_rows(
+                np.zeros_like(schedule.variance[t]) if clean else schedule.variance[after], x_t
+            ),
             eta=recipe.eta,
             noise=torch.from_numpy(drawn),
         )

@@ -1,4 +1,4 @@
-"""What stopping a bundle after fewer denoising steps costs, and what it saves."""
+"""What running fewer of a bundle's denoising steps costs, and what it saves."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -24,6 +24,7 @@ from training.scores import Row, Scorer
 from training.tables import MISSING, Report, heading, percent, table
 
 COVERED_LEVEL = 0.9
+MOST_EACH = 10
 COLUMNS: tuple[tuple[str, str], ...] = (
     ("steps", "{name}"),
     ("ADE", "{ade:.3f} ({ade_ratio:.3f})"),
@@ -86,7 +87,7 @@ def step_curve(  # noqa: PLR0913  # a measurement's protocol, spelled out
     seed: int = 0,
     command: str = "",
 ) -> StepCurve:
-    """Score and time a bundle after 1 to all of its steps; write Markdown, JSON and a picture.
+    """Score and time a bundle with few to all of its steps; write Markdown, JSON and a picture.
 
     Args:
         folder: of the bundle.
@@ -118,10 +119,9 @@ def step_curve(  # noqa: PLR0913  # a measurement's protocol, spelled out
     calibration = manifest.calibration
     trained = trained_on(group.owners, store, learnt_from(manifest, store))
     rows = []
-    for index, median in enumerate(np.median(seconds, axis=0)):
-        ask = BundlePredictor(
-            engine=engine, num_samples=num_samples, num_steps=index + 1, seed=seed
-        )
+    counts = step_counts(manifest.num_steps)
+    for index, (count, median) in enumerate(zip(counts, np.median(seconds, axis=0), strict=True)):
+        ask = BundlePredictor(engine=engine, num_samples=num_samples, num_steps=count, seed=seed)
         scores = _scores(ask, group, store) | {
             "milliseconds": 1000 * float(median),
             "share_of_time": float(shares[index]),
@@ -130,7 +130,7 @@ def step_curve(  # noqa: PLR0913  # a measurement's protocol, spelled out
             Row(
                 group=group.name,
                 bone_lengths="observed",
-                name=f"{index + 1}",
+                name=f"{count}",
                 windows=len(group.owners),
                 scores=scores,
                 trained_on=trained,
@@ -159,19 +159,27 @@ def step_curve(  # noqa: PLR0913  # a measurement's protocol, spelled out
     return curve
 
 
+def step_counts(num_steps: int) -> tuple[int, ...]:
+    """Numbers of steps to look at, the last being all: each one up to ten, else 1, 2, 5, 10, …"""
+    if num_steps <= MOST_EACH:
+        return tuple(range(1, num_steps + 1))
+    round_numbers = (m * 10**power for power in range(6) for m in (1, 2, 5))
+    return (*(count for count in round_numbers if count < num_steps), num_steps)
+
+
 def _timed(
     engine: Engine, group: Group, *, num_samples: int, rounds: int
 ) -> Float[np.ndarray, "rounds K"]:
     """Core seconds of a request by itself, for each number of steps; a first round is not kept."""
-    counts = range(1, engine.manifest.num_steps + 1)
+    counts = step_counts(engine.manifest.num_steps)
     seconds = np.empty((rounds + 1, len(counts)))
     for turn in range(rounds + 1):
         observation = group.windows.observations[turn % len(group.owners)]
-        for count in counts:
+        for index, count in enumerate(counts):
             request = Request(observation=observation, num_samples=num_samples, num_steps=count)
             started_s = process_time()
             predict(engine, request)
-            seconds[turn, count - 1] = process_time() - started_s
+            seconds[turn, index] = process_time() - started_s
     return seconds[1:]
 
 

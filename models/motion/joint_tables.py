@@ -158,3 +158,17 @@ H36M17_FROM_BODY21: Mapping[str, Weights] = {
     "Neck": {"neck": 0.4, "head": 0.6},
     "Head": {"neck": -0.4, "head": 1.4},
 } | {h36m: {body21: 1.0} for h36m, body21 in _H36M_LIMBS.items()}
+
+# HumanEva's limbs are named as Human3.6M's; between pelvis and thorax it has no joint.
+BODY21_FROM_HUMANEVA15: Mapping[str, Weights] = BODY21_FROM_H36M17 | {
+    "hips": {"Pelvis": 0.956, "Thorax": 0.044},
+    "spine": {"Pelvis": 0.765, "Thorax": 0.235},
+    "chest": {"Pelvis": 0.31, "Thorax": 0.69},
+    "neck": {"Pelvis": 0.075, "Thorax": 0.925},
+    "head": {"Thorax": 0.286, "Head": 0.714},
+}
+HUMANEVA15_FROM_BODY21: Mapping[str, Weights] = {"Pelvis": H36M17_FROM_BODY21["Hip"]} | {
+    joint: weights
+    for joint, weights in H36M17_FROM_BODY21.items()
+    if joint not in ("Hip", "Spine", "Neck")
+}

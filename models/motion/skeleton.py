@@ -13,9 +13,11 @@ from jaxtyping import Bool, Float
 from models.motion.joint_tables import (
     ALIASES,
     BODY21_FROM_H36M17,
+    BODY21_FROM_HUMANEVA15,
     BODY21_FROM_SMPL22,
     ESTIMATES,
     H36M17_FROM_BODY21,
+    HUMANEVA15_FROM_BODY21,
     PLACEHOLDERS,
     REQUIRED,
     SMPL22_FROM_BODY21,
@@ -175,14 +177,20 @@ H36M17 = _standard("h36m17", (
     ("LShoulder", 8), ("LElbow", 11), ("LWrist", 12), ("RShoulder", 8), ("RElbow", 14),
     ("RWrist", 15),
 ))
+HUMANEVA15 = _standard("humaneva15", (
+    ("Pelvis", -1), ("Thorax", 0), ("LShoulder", 1), ("LElbow", 2), ("LWrist", 3),
+    ("RShoulder", 1), ("RElbow", 5), ("RWrist", 6), ("LHip", 0), ("LKnee", 8), ("LAnkle", 9),
+    ("RHip", 0), ("RKnee", 11), ("RAnkle", 12), ("Head", 1),
+))
 # fmt: on
-SKELETONS: dict[str, Skeleton] = {s.name: s for s in (BODY21, SMPL22, H36M17)}
+SKELETONS: dict[str, Skeleton] = {s.name: s for s in (BODY21, SMPL22, H36M17, HUMANEVA15)}
 
 _IDENTITY: Mapping[str, Weights] = {joint: {joint: 1.0} for joint in BODY21.joints}
 _TABLES: dict[frozenset[str], tuple[Mapping[str, Weights], Mapping[str, Weights]]] = {
     frozenset(BODY21.joints): (_IDENTITY, _IDENTITY),
     frozenset(SMPL22.joints): (BODY21_FROM_SMPL22, SMPL22_FROM_BODY21),
     frozenset(H36M17.joints): (BODY21_FROM_H36M17, H36M17_FROM_BODY21),
+    frozenset(HUMANEVA15.joints): (BODY21_FROM_HUMANEVA15, HUMANEVA15_FROM_BODY21),
 }
 
 

@@ -7,7 +7,6 @@ from itertools import groupby
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from models.diffusion import timesteps
 from service.engine.context import Context, unencoded
 from service.engine.costs import Costs
 from service.engine.runner import Runner
@@ -59,6 +58,12 @@ class Denoising:
         return self.future if self.request.previews else None
 
     @property
+    def now_and_next(self) -> tuple[int, int | None]:
+        """The timestep whose turn it is, and the one after; None after the last."""
+        following = self.timesteps[self.steps_run + 1 :]
+        return self.timesteps[self.steps_run], following[0] if following else None
+
+    @property
     def over(self) -> bool:
         """Whether the leg has no step left."""
         return self.steps_run == len(self.timesteps)
@@ -101,16 +106,17 @@ class Denoiser:
         """All samples before their first step; where nothing is drawn, a single one."""
         manifest = self._manifest
         num_samples = request.num_samples if self._schedule else 1
-        steps = request.num_steps or manifest.num_steps
+        steps = manifest.timesteps(request.num_steps)
+        whole = len(steps) == manifest.chain_steps(request.num_steps)
         horizon = request.horizon or manifest.horizon
         parts = Denoising(
             request_id=request_id,
             request=request,
             sample_indices=np.arange(num_samples),
             context=Context(tensors={"observation": request.observation[None]}),
-            timesteps=timesteps(manifest.num_steps, steps),
+            timesteps=steps,
             num_legs=-(-horizon // manifest.horizon),
-            stopped_by="end" if steps == manifest.num_steps else "num_steps",
+            stopped_by="end" if whole else "num_steps",
             past=np.empty((num_samples, 0, len(manifest.skeleton.joints), 3), np.float32),
         )
         return [parts]
@@ -181,7 +187,8 @@ class Denoiser:
         parts = [(part.context, len(part)) for part in rows]
         x0 = self._runner.run("denoiser", {"x_t": x_t, "timestep": steps}, parts)["x0"]
         drawn = self._draw(rows) if self._draws else None
-        return x0, stepper.x_next(x_t, x0, timestep=steps, noise=drawn)
+        weights = np.repeat([stepper.weights(*part.now_and_next) for part in rows], counts, axis=0)
+        return x0, stepper.x_next(x_t, x0, weights=weights, noise=drawn)
 
     def _draw(self, rows: Sequence[Denoising]) -> Float[np.ndarray, "B ..."]:
         draws = [

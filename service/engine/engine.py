@@ -150,7 +150,9 @@ class Engine:
     def steps_of(self, request: Request) -> int:
         """The steps of all its legs, were it to run them all."""
         horizon = self.manifest.horizon
-        return self.manifest.num_steps * math.ceil((request.horizon or horizon) / horizon)
+        return self.manifest.chain_steps(request.num_steps) * math.ceil(
+            (request.horizon or horizon) / horizon
+        )
 
     def seconds_until_free(self, *, requests: int, rows: int, shares: int = 1) -> float:
         """When so many requests, with so many rows, will probably have ended."""

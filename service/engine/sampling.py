@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 
 from models.diffusion import Schedule, ddim_step
 
@@ -45,26 +45,31 @@ class Stepper:
     """The step of a schedule as a sum: of x_t, of x0 and of noise, weighted by timestep."""
 
     def __init__(self, schedule: Schedule, *, eta: float) -> None:
-        # Entry 0 is the clean end, where the step after timestep 0 arrives.
-        alpha_bar = np.concatenate([[1.0], schedule.alpha_bar])[:, None]
-        variance = np.concatenate([np.zeros_like(schedule.variance[:1]), schedule.variance])
+        self._schedule = schedule
+        self._eta = eta
+        self._weights: dict[tuple[int, int | None], Float[np.ndarray, "3 N"]] = {}
 
-        def weight(**one: float) -> Float[np.ndarray, "K N"]:
-            """What the step makes of 1 in the place of one of the three, and 0 for the others."""
-            made: Float[np.ndarray, "K N"] = ddim_step(
-                **({"x_t": 0.0, "x0": 0.0, "noise": 0.0} | one),
-                alpha_bar=alpha_bar[1:],
-                variance=variance[1:],
-                alpha_bar_next=alpha_bar[:-1],
-                variance_next=variance[:-1],
-                eta=eta,
-            )
-            return made
+    def weights(self, timestep: int, following: int | None) -> Float[np.ndarray, "3 N"]:
+        """How much of x_t, of x0 and of noise the step to a timestep, or to the end, adds up."""
+        if (timestep, following) not in self._weights:
+            self._weights[timestep, following] = self._made(timestep, following)
+        return self._weights[timestep, following]
 
-        self._of_x_t, self._of_x0, self._of_noise = (
-            weight(x_t=1.0),
-            weight(x0=1.0),
-            weight(noise=1.0),
+    def _made(self, timestep: int, following: int | None) -> Float[np.ndarray, "3 N"]:
+        alpha_bar, variance = self._schedule.alpha_bar, self._schedule.variance
+        clean = following is None
+        return np.stack(
+            [
+                ddim_step(
+                    **dict(zip(("x_t", "x0", "noise"), one, strict=True)),
+                    alpha_bar=alpha_bar[timestep],
+                    variance=variance[timestep],
+                    alpha_bar_next=1.0 if clean else alpha_bar[following],
+                    variance_next=np.zeros_like(variance[0]) if clean else variance[following],
+                    eta=self._eta,
+                )
+                for one in np.eye(3)
+            ]
         )
 
     def x_next(
@@ -72,13 +77,13 @@ class Stepper:
         x_t: Float[np.ndarray, "B ..."],
         x0: Float[np.ndarray, "B ..."],
         *,
-        timestep: Int64[np.ndarray, "B"],
+        weights: Float[np.ndarray, "B 3 N"],
         noise: Float[np.ndarray, "B ..."] | None,
     ) -> Float[np.ndarray, "B ..."]:
         """x at each row's next, less noisy timestep; the step is taken in float64."""
         shape = (len(x_t), -1, *(1,) * (x_t.ndim - 2))
-        x = self._of_x_t[timestep].reshape(shape) * x_t
-        x += self._of_x0[timestep].reshape(shape) * x0
+        x = weights[:, 0].reshape(shape) * x_t
+        x += weights[:, 1].reshape(shape) * x0
         if noise is not None:
-            x += self._of_noise[timestep].reshape(shape) * noise
+            x += weights[:, 2].reshape(shape) * noise
         return np.asarray(x, np.float32)

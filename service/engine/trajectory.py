@@ -18,7 +18,8 @@ StoppedBy = Literal["end", "num_steps", "deadline", "tolerance"]
 class Request:
     """An observation in the bundle's skeleton, rate and metres, and how to continue it.
 
-    ``num_steps`` of the bundle's K denoising steps are run; None runs them all. ``actions`` are
+    ``num_steps`` of the bundle's K denoising steps are run, those of its plan; None runs as many as
+    its manifest says. ``actions`` are
     indices of the manifest's labels, performed one after the other; a bundle that performs actions
     needs one at least. ``stop_threshold_m`` and ``max_frames`` (of one action) are the manifest's
     by default. At ``deadline_s``, on the engine's clock (``time.perf_counter``), the answer is what

@@ -67,6 +67,40 @@ def test_file_that_is_wrong_of_its_actions_says_where(actions_bundle: Path, tmp_
         read_manifest(tmp_path)
 
 
+def planned(folder: Path, **fields: Any) -> Manifest:
+    schedule = read_manifest(folder).schedule
+    assert schedule is not None
+    return changed(folder, schedule=schedule.model_dump() | fields)
+
+
+def test_steps_stop_early_where_a_manifest_says_nothing_of_them(bundles: Path):
+    manifest = read_manifest(bundles / "diffusion")
+    assert manifest.timesteps(None) == tuple(range(9, -1, -1))
+    assert manifest.timesteps(4) == (9, 8, 7, 6)
+    assert (manifest.default_steps, manifest.chain_steps(4)) == (10, 10)
+
+
+def test_stride_walks_to_the_end_in_as_many_steps_as_are_asked_for(bundles: Path):
+    manifest = planned(bundles / "diffusion", plan="stride", default_steps=5)
+    assert manifest.timesteps(None) == (9, 7, 5, 3, 1)
+    assert manifest.timesteps(2) == (9, 4)
+    assert (manifest.default_steps, manifest.chain_steps(None)) == (5, 5)
+    assert (manifest.num_steps, manifest.chain_steps(2)) == (10, 2)
+
+
+def test_plan_counts_for_the_digest_and_its_absence_does_not(bundles: Path):
+    manifest = read_manifest(bundles / "diffusion")
+    assert planned(bundles / "diffusion", plan="stop_early").digest == manifest.digest
+    others = {"plan": "stride"}, {"default_steps": 5}
+    digests = {planned(bundles / "diffusion", **fields).digest for fields in others}
+    assert len(digests | {manifest.digest}) == 3
+
+
+def test_default_of_more_steps_than_there_are_is_refused(bundles: Path):
+    with pytest.raises(ValidationError, match="at most 10"):
+        planned(bundles / "diffusion", default_steps=11)
+
+
 CALIBRATION = CalibrationSpec(
     levels=(0.5, 0.9),
     times_s=(0.1, 0.3),

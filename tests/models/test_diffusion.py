@@ -160,10 +160,24 @@ def test_early_stop_takes_the_noisiest_timesteps_first(num_steps, data):
     assert taken == tuple(reversed(range(num_steps)))[:stop_after]
 
 
-@pytest.mark.parametrize("stop_after", [0, 11, -1])
-def test_more_steps_than_the_chain_has_are_refused(stop_after):
+@given(num_timesteps=st.integers(1, 200), data=st.data())
+def test_stride_starts_at_the_noisiest_and_spreads_evenly(num_timesteps, data):
+    num_steps = data.draw(st.integers(1, num_timesteps))
+    taken = timesteps(num_timesteps, num_steps, plan="stride")
+    assert (len(taken), taken[0]) == (num_steps, num_timesteps - 1)
+    gaps = -np.diff([*taken, -1])
+    assert {*gaps} <= {num_timesteps // num_steps, -(-num_timesteps // num_steps)}
+
+
+def test_stride_of_ten_of_a_hundred():
+    assert timesteps(100, 10, plan="stride") == (99, 89, 79, 69, 59, 49, 39, 29, 19, 9)
+
+
+@pytest.mark.parametrize("plan", ["stop_early", "stride"])
+@pytest.mark.parametrize("num_steps", [0, 11, -1])
+def test_more_steps_than_the_chain_has_are_refused(num_steps, plan):
     with pytest.raises(ValueError, match="must be from 1 to 10"):
-        timesteps(10, stop_after)
+        timesteps(10, num_steps, plan=plan)
 
 
 @pytest.mark.parametrize(

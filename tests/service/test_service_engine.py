@@ -1,7 +1,7 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, zip_longest
 from pathlib import Path
 from threading import Thread
 
@@ -34,13 +34,18 @@ def futures(engine: Engine, request: Request) -> np.ndarray:
     return predict(engine, request).futures
 
 
+def early(num_steps: int) -> Sequence[int]:
+    """The timesteps of a chain that stops early."""
+    return range(NUM_STEPS - 1, NUM_STEPS - 1 - num_steps, -1)
+
+
 def slow_obvious_future(
     folder: Path,
     observation: np.ndarray = WALK,
     *,
     seed: int,
     sample: int,
-    num_steps: int,
+    chain: Sequence[int],
     leg: int = 0,
 ) -> np.ndarray:
     """One sample, one graph call after another, straight from the files."""
@@ -57,11 +62,10 @@ def slow_obvious_future(
     draws = [
         np.random.Generator(np.random.Philox(key=[seed, sample], counter=[0, 0, 0, first + k]))
         .standard_normal(X_T_SHAPE, dtype=np.float32)
-        for k in range(num_steps + 1)
+        for k in range(len(chain) + 1)
     ]  # fmt: skip
     x_t = np.float32(np.sqrt(variance[-1]) * draws[0])
-    for k in range(num_steps):
-        t = NUM_STEPS - 1 - k
+    for k, (t, after) in enumerate(zip_longest(chain, chain[1:])):
         feed = {"x_t": x_t[None], "timestep": np.array([t]), "context": context}
         x0 = graph["denoiser"].run(None, feed)[0][0]
         x_t = np.float32(
@@ -70,8 +74,8 @@ def slow_obvious_future(
                 x0=x0,
                 alpha_bar=alpha_bar[t],
                 variance=variance[t],
-                alpha_bar_next=alpha_bar[t - 1] if t else 1.0,
-                variance_next=variance[t - 1] if t else 0.0,
+                alpha_bar_next=1.0 if after is None else alpha_bar[after],
+                variance_next=0.0 if after is None else variance[after],
                 eta=manifest.schedule.eta,
                 noise=draws[k + 1],
             )
@@ -107,8 +111,31 @@ def test_engine_equals_a_loop_over_the_graphs(
     folder = stochastic_bundle if bundle == "stochastic" else bundles / bundle
     answer = futures(engine_of(folder, rows_per_step=5), request(7, num_steps=num_steps))
     for sample in range(3):
-        expected = slow_obvious_future(folder, seed=7, sample=sample, num_steps=num_steps)
+        expected = slow_obvious_future(folder, seed=7, sample=sample, chain=early(num_steps))
         np.testing.assert_allclose(answer[sample], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("bundle", ["diffusion", "stochastic"])
+@pytest.mark.parametrize(
+    ("num_steps", "chain"), [(None, (9, 7, 5, 3, 1)), (3, (9, 6, 3)), (1, (9,))]
+)
+def test_stride_walks_the_whole_chain_in_fewer_steps(
+    bundles: Path,
+    stochastic_bundle: Path,
+    bundle: str,
+    num_steps: int | None,
+    chain: tuple[int, ...],
+):
+    folder = stochastic_bundle if bundle == "stochastic" else bundles / bundle
+    manifest = read_manifest(folder)
+    assert manifest.schedule is not None
+    plan = manifest.schedule.model_copy(update={"plan": "stride", "default_steps": 5})
+    runner = Runner(manifest.model_copy(update={"schedule": plan}), folder, threads=1)
+    result = predict(Engine(runner), request(7, num_steps=num_steps))
+    for sample in range(3):
+        expected = slow_obvious_future(folder, seed=7, sample=sample, chain=chain)
+        np.testing.assert_allclose(result.futures[sample], expected, atol=1e-6)
+    assert (result.steps_run, result.steps_of, result.stopped_by) == (len(chain), len(chain), "end")
 
 
 def test_same_seed_gives_the_same_bytes_and_another_seed_another_future(bundles: Path):
@@ -192,7 +219,7 @@ def test_longer_horizon_enters_the_last_frames_again(
         frames = WALK
         for leg in range(3):
             seen = frames[-len(WALK) :]
-            made = slow_obvious_future(folder, seen, seed=7, sample=sample, num_steps=3, leg=leg)
+            made = slow_obvious_future(folder, seen, seed=7, sample=sample, chain=early(3), leg=leg)
             frames = np.concatenate([frames, made])
         np.testing.assert_allclose(future, frames[len(WALK) :][:130], atol=2e-6)
 

@@ -9,6 +9,7 @@ from models.motion.skeleton import BODY21
 from training.metrics import (
     ade,
     apd,
+    apd_of_largest,
     bones,
     class_means,
     cmd,
@@ -82,6 +83,14 @@ def test_apd_of_one_dimensional_samples_is_the_mean_over_all_pairs():
     samples = np.zeros((1, 4, 1, 2, 3))
     samples[0, :, 0, 1, 0] = [0.0, 1.0, 2.0, 3.0]
     assert apd(samples)[0] == pytest.approx(10 / 6)
+
+
+def test_apd_of_the_largest_leaves_the_nearer_pairs_out():
+    samples = np.zeros((1, 4, 1, 2, 3))
+    samples[0, :, 0, 1, 0] = [0.0, 1.0, 2.0, 3.0]  # distances 3, 2, 2, 1, 1, 1
+    assert apd_of_largest(samples, pairs=2)[0] == pytest.approx(5 / 2)
+    assert apd_of_largest(samples)[0] == pytest.approx(apd(samples)[0])
+    assert apd_of_largest(samples[:, :1])[0] == 0.0
 
 
 def test_apd_of_equal_samples_and_of_one_sample_is_zero():

@@ -9,12 +9,20 @@ from people import small_store
 from models.bundle import read_manifest
 from training.data.store import Store
 from training.evaluate import EvaluateError, evaluate
-from training.step_curve import step_curve
+from training.step_curve import step_counts, step_curve
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return small_store(tmp_path_factory.mktemp("small") / "store")
+
+
+@pytest.mark.parametrize(
+    ("num_steps", "counts"),
+    [(1, (1,)), (4, (1, 2, 3, 4)), (30, (1, 2, 5, 10, 20, 30)), (100, (1, 2, 5, 10, 20, 50, 100))],
+)
+def test_long_chains_are_looked_at_in_round_numbers(num_steps, counts):
+    assert step_counts(num_steps) == counts
 
 
 def test_curve_has_a_row_for_each_number_of_steps(store: Store, bundles: Path, tmp_path: Path):

@@ -14,13 +14,20 @@ import numpy as np
 from jaxtyping import Float
 
 from models.motion.formats.files import read_motion
-from models.motion.formats.h36m import holds_h36m, read_h36m
 from models.motion.formats.labelled_smpl import holds_labelled_smpl, read_labelled_smpl
 from models.motion.formats.npz import Clip, read_archive
+from models.motion.formats.positions_3d import holds_positions_3d, read_positions_3d
 from models.motion.motion import Motion
+from models.motion.skeleton import HUMANEVA15
 
 VALID_SHARE = 0.08
 H36M_TEST_SUBJECTS = ("S9", "S11")
+HUMANEVA_DAMAGED = (
+    ("Train/S3", "Walking 1 chunk0"),
+    ("Train/S3", "Walking 1 chunk2"),
+    ("Validate/S3", "Walking 1 chunk4"),
+)
+"""Chunks that the field's protocol leaves out (Yuan and Kitani 2020)."""
 KINDS = (".npz", ".amc", ".bvh")
 """In this order, so that where a take is found twice the one on the actor's own skeleton stays."""
 
@@ -65,8 +72,12 @@ def read_takes(path: Path) -> Iterator[Take]:
     Raises:
         FormatError: the file cannot be read.
     """
-    if path.suffix.lower() == ".npz" and holds_h36m(path):
-        yield from (_of_h36m(subject, motion) for subject, motion in read_h36m(path))
+    if path.suffix.lower() == ".npz" and holds_positions_3d(path):
+        for subject, action, motion in read_positions_3d(path):
+            if motion.skeleton != HUMANEVA15:
+                yield _of_h36m(subject, action, motion)
+            elif (subject, action) not in HUMANEVA_DAMAGED:
+                yield _of_humaneva(subject, action, motion)
     elif path.suffix.lower() == ".npz" and holds_labelled_smpl(path):
         yield from (_labelled(path, action, motion) for action, motion in read_labelled_smpl(path))
     elif path.suffix.lower() == ".npz":
@@ -84,10 +95,27 @@ def read_takes(path: Path) -> Iterator[Take]:
         )
 
 
-def _of_h36m(subject: str, motion: Motion) -> Take:
+def _of_h36m(subject: str, action: str, motion: Motion) -> Take:
     split = "test" if subject in H36M_TEST_SUBJECTS else "train"
-    action = motion.name.removeprefix(f"{subject}_").rstrip("_0123456789")
-    return Take(motion=motion, split=split, source="h36m", action=action, subject=subject)
+    return Take(
+        motion=motion,
+        split=split,
+        source="h36m",
+        action=action.replace(" ", "_").rstrip("_0123456789"),
+        subject=subject,
+    )
+
+
+def _of_humaneva(subject: str, action: str, motion: Motion) -> Take:
+    """A chunk of a take such as ``Walking 1 chunk0`` of ``Validate/S1``."""
+    part, _, person = subject.partition("/")
+    return Take(
+        motion=motion,
+        split="train" if part == "Train" else "test",
+        source="humaneva",
+        action=action.split(" ")[0],
+        subject=person,
+    )
 
 
 def _labelled(path: Path, action: str, motion: Motion) -> Take:

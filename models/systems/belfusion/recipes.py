@@ -3,6 +3,7 @@
 import dataclasses
 from functools import partial
 
+from models.continuation import Continuation
 from models.diffusion import sqrt_schedule
 from models.motion.skeleton import BODY21, H36M17, SMPL22
 from models.pose import RootRelativePoses, WorldPoses
@@ -35,7 +36,7 @@ def build_spectral(*, data: Data, sizes: SpectralSizes, root_weight: float) -> B
     """Our form: everything dense, the world trajectory among the features."""
     representation = WorldPoses(data.skeleton, root_weight=root_weight)
     features = representation.num_features
-    continuation = spectral.Continuation(
+    continuation = Continuation(
         features=features,
         num_target=sizes.num_target,
         horizon=data.horizon,

@@ -12,47 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from models.continuation import Continuation
 from models.layers import MLP, Affine
-from models.pose import continuation_basis, cosine_basis
+from models.pose import cosine_basis
 from models.system import Batch
 
 LOG_VARIANCE_LIMIT = 10.0
 INPUT_LIMIT = 8.0
-
-
-class Continuation(nn.Module):
-    """Where the last observed frames point, and the basis in which futures deviate from there.
-
-    The expectation is one linear filter per feature, fitted by least squares; the basis is zero
-    at the last observed frame. So whatever the latent, a future starts at the last pose with
-    the last velocity.
-    """
-
-    basis: Tensor
-    filter: Tensor
-
-    def __init__(self, *, features: int, num_target: int, horizon: int, bases: int) -> None:
-        super().__init__()
-        self.bases = bases
-        self.register_buffer("basis", continuation_basis(bases, horizon), persistent=False)
-        self.register_buffer("filter", torch.zeros(features, horizon, num_target - 1))
-
-    def expected(self, target: Float[Tensor, "B C F"]) -> Float[Tensor, "B H F"]:
-        """The future if nothing but the last frames counted."""
-        steps = (target[:, :-1] - target[:, -1:]).permute(2, 1, 0)  # (F, C - 1, B)
-        return target[:, -1:] + torch.matmul(self.filter, steps).permute(2, 1, 0)
-
-    def spectrum(
-        self, target: Float[Tensor, "B C F"], future: Float[Tensor, "B H F"]
-    ) -> Float[Tensor, "B KF"]:
-        """Coefficients of what sets the future apart from the expected one."""
-        return torch.matmul(self.basis.T, future - self.expected(target)).flatten(1)
-
-    def frames(
-        self, spectrum: Float[Tensor, "B KF"], expected: Float[Tensor, "B H F"]
-    ) -> Float[Tensor, "B H F"]:
-        """The future that deviates from the expected one by a spectrum."""
-        return expected + torch.matmul(self.basis, spectrum.unflatten(1, (self.bases, -1)))
 
 
 class SpectralBehaviourEncoder(nn.Module):
@@ -161,12 +127,7 @@ def fit_linear_parts(
     pairs = [network.features(next_batch())[1:] for _ in range(num_batches)]
     target = torch.cat([pair[0] for pair in pairs])
     future = torch.cat([pair[1] for pair in pairs])
-    steps = (target[:, :-1] - target[:, -1:]).permute(2, 0, 1).double()  # (F, B, C - 1)
-    moved = (future - target[:, -1:]).permute(2, 0, 1).double()
-    # Noise of every frame, that of the last one shared by all steps.
-    ridge = len(target) * noise_m**2 * (torch.eye(steps.shape[2]).to(steps) + 1)
-    filter_t = torch.linalg.solve(steps.mT @ steps + ridge, steps.mT @ moved)
-    continuation.filter.copy_(filter_t.mT)
+    continuation.fit(target, future, noise_m=noise_m)
     spectra = continuation.spectrum(target, future)
     mean = spectra.mean(dim=0)
     values, vectors = torch.linalg.eigh(torch.cov((spectra - mean).T.double()))
