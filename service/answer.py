@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from models.bundle import Manifest
-from service.axes import UNITS_PER_METRE
+from models.motion.axes import UNITS_PER_METRE
 from service.engine.trajectory import Preview, Result, Segment
 from service.futures import DECIMALS, BoneLengths, caller_futures, caller_segments, written
 from service.media import encoded
@@ -46,10 +46,12 @@ class Answer:
         part = self._continued(result) if self.manifest.actions is None else self._performed(result)
         caller = self.observation.caller
         names = dict(zip(caller.order, caller.skeleton.joints, strict=True))
+        sources = dict(zip(caller.order, caller.sources, strict=True))
         content = self.head() | {
             "fps": caller.fps,
             "skeleton": caller.skeleton.name,
             "joints": [names[i] for i in range(len(names))],
+            "joint_sources": [sources[i] for i in range(len(names))],
             **part,
             "warnings": [*self.observation.warnings, *self.warnings],
         }

@@ -15,7 +15,6 @@ from models.motion.skeleton import Skeleton
 from service import schemas
 from service.actions import action_indices, max_frames
 from service.answer import Answer
-from service.axes import Axes
 from service.body import BodyRoute
 from service.delivery import Stream, event, unless_gone
 from service.dependencies import TheCatalog, TheSettings, metrics_of, settings_of, visit_of
@@ -128,7 +127,9 @@ async def predict(
     manifest, worker = catalog.ready(body.model, with_actions=False)
     horizon = _horizon(body, settings, manifest)
     frames = horizon or manifest.horizon
-    _check_limits(body, settings, manifest, frames=frames)
+    _check_limits(body, settings)
+    observation = await _observation(body, manifest)
+    _check_answer(body, settings, manifest, frames=frames, fps=observation.caller.fps)
     if "quantiles" in body.returned:
         check_levels(
             body.quantile_levels,
@@ -136,7 +137,7 @@ async def predict(
             calibration=manifest.calibration,
         )
     request = trajectory.Request(
-        observation=(observation := await _observation(body, manifest)).positions,
+        observation=observation.positions,
         num_samples=body.num_samples,
         num_steps=body.num_steps,
         seed=_seed(body),
@@ -187,9 +188,12 @@ async def predict_actions(
     manifest, worker = catalog.ready(body.model, with_actions=True)
     indices = action_indices(body.actions, manifest)
     longest = max_frames(body.max_seconds_per_action, manifest)
-    _check_limits(body, settings, manifest, frames=len(indices) * (longest or manifest.horizon))
+    _check_limits(body, settings)
+    observation = await _observation(body, manifest)
+    most = len(indices) * (longest or manifest.horizon)
+    _check_answer(body, settings, manifest, frames=most, fps=observation.caller.fps)
     request = trajectory.Request(
-        observation=(observation := await _observation(body, manifest)).positions,
+        observation=observation.positions,
         num_samples=body.num_samples,
         seed=_seed(body),
         actions=indices,
@@ -242,9 +246,11 @@ async def _observation(body: schemas.ObservedMotion, manifest: Manifest) -> Obse
         return read_observation(
             body.poses,
             skeleton=_skeleton(body, manifest),
-            axes=Axes(up=body.axes.up, units=body.axes.units),
-            fps=body.fps or manifest.fps,
+            axes=body.axes.axes(),
+            fps=body.fps,
             manifest=manifest,
+            times=body.timestamps,
+            confidence=body.confidence,
         )
 
     return await asyncio.to_thread(read) if len(body.poses) > MANY_FRAMES else read()
@@ -367,10 +373,7 @@ def _skeleton(body: schemas.ObservedMotion, manifest: Manifest) -> Skeleton | Ow
     return standard_skeleton(body.skeleton)
 
 
-def _check_limits(
-    body: schemas.ObservedMotion, settings: Settings, manifest: Manifest, *, frames: int
-) -> None:
-    """The engine holds ``frames`` a future, at the bundle's rate; the answer, at the caller's."""
+def _check_limits(body: schemas.ObservedMotion, settings: Settings) -> None:
     if body.num_samples > settings.max_samples:
         raise FieldError(
             pointer="/num_samples",
@@ -383,7 +386,18 @@ def _check_limits(
             found=f"{len(body.poses)} frames",
             expected=f"this server takes at most {settings.max_frames}; send the last ones",
         )
-    longest = max(frames, num_frames(frames, manifest=manifest, fps=body.fps or manifest.fps))
+
+
+def _check_answer(
+    body: schemas.ObservedMotion,
+    settings: Settings,
+    manifest: Manifest,
+    *,
+    frames: int,
+    fps: float,
+) -> None:
+    """The engine holds ``frames`` a future, at the bundle's rate; the answer, at the caller's."""
+    longest = max(frames, num_frames(frames, manifest=manifest, fps=fps))
     if body.num_samples * longest > settings.max_poses:
         raise FieldError(
             pointer="/num_samples",

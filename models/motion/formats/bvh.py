@@ -1,6 +1,5 @@
 """BVH files: read into metres with +Z up, and written for animation tools."""
 
-import math
 from collections.abc import Iterator, Sequence
 from io import TextIOBase
 from pathlib import Path
@@ -12,6 +11,7 @@ from models.motion import rotations as rot
 from models.motion.formats.bvh_hierarchy import Joint, read_hierarchy
 from models.motion.formats.bvh_rows import frames_per_second, read_counts, read_rows
 from models.motion.formats.text import read_lines
+from models.motion.guesses import plausible_factor
 from models.motion.kinematics import global_rotations, inverse_kinematics, rest_pose
 from models.motion.motion import Motion
 from models.motion.skeleton import Skeleton, resolve_joints
@@ -21,7 +21,6 @@ _ORDER = "ZXY"
 _ROTATION_CHANNELS = " ".join(f"{axis}rotation" for axis in _ORDER)
 _POSITION_CHANNELS = "Xposition Yposition Zposition"
 _TIP = 0.3  # length of an End Site as a part of the bone before it
-_LEGS_M = (0.4, 1.15)  # hip to ankle, from a child of four to a very tall adult
 _LEG_PER_REACH = 0.7  # hip to ankle as a part of the longest chain of bones from the hips
 
 
@@ -72,8 +71,7 @@ def guess_scale(offsets: Float[np.ndarray, "J 3"], skeleton: Skeleton) -> float:
     bones = [found[joint] for joint in ("left_lower_leg", "left_foot") if joint in found]
     leg = float(sum(lengths[skeleton.index(bone)] for bone in bones))
     leg = leg or _reach(lengths, skeleton) * _LEG_PER_REACH
-    plausible = (unit for unit in UNITS_M if _LEGS_M[0] <= leg * unit <= _LEGS_M[1])
-    return next(plausible, 0.01 if leg == 0 else min(UNITS_M, key=lambda u: abs(math.log(leg * u))))
+    return plausible_factor(leg, UNITS_M) if leg else UNITS_M[0]
 
 
 def _reach(lengths: Float[np.ndarray, "J"], skeleton: Skeleton) -> float:
