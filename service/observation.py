@@ -159,7 +159,7 @@ def observe(seen: Seen, *, axes: Axes, fps: float, manifest: Manifest) -> Observ
     window, warnings = _whole(recent, fps)
     window = window[-num_frames - 1 :]
     is_seen = np.isfinite(window[0, :, 0])
-    weights, guessed = _weights(skeleton, is_seen, target)
+    weights, guessed = body_weights(skeleton, is_seen, target)
     root = np.matmul(weights[0], window[-1, is_seen])
     lowest = float(window[-1, is_seen, 2].min())
     offset = np.array([root[0], root[1], lowest if abs(lowest) > MAX_HEIGHT_M else 0.0])
@@ -269,10 +269,15 @@ def _whole(recent: Seen, fps: float) -> tuple[Float[np.ndarray, "T J 3"], list[s
     return world, warnings
 
 
-def _weights(
+def body_weights(
     skeleton: Skeleton, seen: Bool[np.ndarray, "J"], target: Skeleton
 ) -> tuple[Float[np.ndarray, "Jb S"], list[str]]:
-    """The map from the joints that were seen, and a warning for those that it has to guess."""
+    """The map from the joints that were seen, and a warning for those that it has to guess.
+
+    Raises:
+        PosesError: too few joints were seen.
+        UnknownSkeletonError: the skeleton has too few.
+    """
     missing = [joint for joint, is_seen in zip(skeleton.joints, seen, strict=True) if not is_seen]
     try:
         weights, known = joint_map(without_joints(skeleton, seen), target)
@@ -297,7 +302,7 @@ def _weights(
 
 def _used(skeleton: Skeleton, target: Skeleton) -> list[int]:
     """The joints that the model sees; a file may hold others, such as the origin of its scene."""
-    weights, _ = _weights(skeleton, np.ones(skeleton.num_joints, dtype=bool), target)
+    weights, _ = body_weights(skeleton, np.ones(skeleton.num_joints, dtype=bool), target)
     return [int(joint) for joint in np.flatnonzero(weights.any(axis=0))]
 
 

@@ -11,7 +11,6 @@ import orjson
 from fastapi import APIRouter, Header, Request, Response
 
 from models.bundle import Manifest
-from models.motion.skeleton import Skeleton
 from service import schemas
 from service.actions import action_indices, max_frames
 from service.answer import Answer
@@ -41,7 +40,7 @@ from service.observation import Observation, read_observation
 from service.problems import declared
 from service.quantiles import check_levels
 from service.settings import Settings
-from service.skeletons import OwnJoints, standard_skeleton
+from service.skeletons import requested_skeleton
 from service.telemetry import record_stages
 from service.visits import CLIENT_GONE
 from service.worker import Timing, Worker
@@ -245,7 +244,7 @@ async def _observation(body: schemas.ObservedMotion, manifest: Manifest) -> Obse
     def read() -> Observation:
         return read_observation(
             body.poses,
-            skeleton=_skeleton(body, manifest),
+            skeleton=requested_skeleton(body.caller_skeleton(), manifest),
             axes=body.axes.axes(),
             fps=body.fps,
             manifest=manifest,
@@ -363,14 +362,6 @@ async def _streamed(
         failed=visit.failed,
         ended=closed,
     )
-
-
-def _skeleton(body: schemas.ObservedMotion, manifest: Manifest) -> Skeleton | OwnJoints:
-    if isinstance(body.skeleton, schemas.SkeletonBody):
-        return body.skeleton.own_joints()
-    if body.skeleton is None or body.skeleton == manifest.skeleton.name:
-        return manifest.skeleton.skeleton()
-    return standard_skeleton(body.skeleton)
 
 
 def _check_limits(body: schemas.ObservedMotion, settings: Settings) -> None:

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, InstanceOf, Ta
 
 from models.motion.axes import Axes, Handed, Units, Up
 from models.motion.standards import STANDARDS
+from service.checks import About
 from service.engine.trajectory import StoppedBy
 from service.example import ACTIONS_EXAMPLE, EXAMPLE
 from service.futures import BoneLengths
@@ -136,6 +137,12 @@ class ObservedPoses(_Body):
     )
     model: str | None = Field(default=None, description="a name of GET /models")
 
+    def caller_skeleton(self) -> str | OwnJoints | None:
+        """The skeleton as the service uses it: a name, own joints, or none that is said."""
+        if isinstance(self.skeleton, SkeletonBody):
+            return self.skeleton.own_joints()
+        return self.skeleton
+
 
 class ObservedMotion(ObservedPoses):
     """An observed motion, and what every request may say of it and of its futures."""
@@ -229,6 +236,48 @@ class FileObservation(_Body):
     start_s: float = Field(description="of the first frame in the file")
     duration_s: float = Field(description="of the whole file")
     warnings: list[str]
+
+
+class ValidationFinding(_Body):
+    """Something odd."""
+
+    about: About
+    sentence: str
+
+
+class Problem(BaseModel):
+    """What went wrong (RFC 9457)."""
+
+    type: str = Field(examples=["/problems/unknown-skeleton"])
+    title: str
+    status: int
+    detail: str = Field(description="where, what was found, what would be right")
+    pointer: str | None = Field(default=None, description="the field, as a JSON pointer")
+    found: str | None = None
+    expected: str | None = None
+    retry_after_s: float | None = Field(
+        default=None, description="when to ask again, where it helps"
+    )
+
+
+class Validation(_Body):
+    """How poses are understood, and what is odd about them."""
+
+    predicts: bool = Field(description="whether they can be predicted from as they are")
+    problem: Problem | None = Field(default=None, description="why not")
+    skeleton: str
+    joints: list[str]
+    joint_sources: list[Source] = Field(description="of each joint, as an answer tells them")
+    map: dict[str, str] = Field(description="{own joint: the joint of body21 that it is}")
+    estimated: dict[str, list[str]] = Field(
+        description="{joint of body21 that none is: the own joints that tell where it is}"
+    )
+    guessed: list[str] = Field(description="joints of body21 of which nothing is known")
+    axes: AxesBody = Field(description="as they were said, or are usual for the skeleton")
+    looks_like: AxesBody = Field(description="what the poses look like")
+    fps: float
+    findings: list[ValidationFinding]
+    warnings: list[str] = Field(description="what a prediction would say beside its futures")
 
 
 class ModelRef(_Body):
@@ -432,18 +481,3 @@ class Limits(_Body):
     max_queued_rows: int = Field(description="samples under way, for one model")
     max_streams: int = Field(description="open at a time")
     rate_limit: str | None = Field(description="predictions of each caller")
-
-
-class Problem(BaseModel):
-    """What went wrong (RFC 9457)."""
-
-    type: str = Field(examples=["/problems/unknown-skeleton"])
-    title: str
-    status: int
-    detail: str = Field(description="where, what was found, what would be right")
-    pointer: str | None = Field(default=None, description="the field, as a JSON pointer")
-    found: str | None = None
-    expected: str | None = None
-    retry_after_s: float | None = Field(
-        default=None, description="when to ask again, where it helps"
-    )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from models.bundle import Manifest
 from models.motion.guesses import above, guessed_parents
 from models.motion.skeleton import (
     SENT_ORDERS,
@@ -40,6 +41,19 @@ def standard_skeleton(name: str) -> Skeleton:
             expected=f"must be one of {', '.join(sorted(SKELETONS))}, or own joints and a map",
         )
     return SKELETONS[name]
+
+
+def requested_skeleton(asked: str | OwnJoints | None, manifest: Manifest) -> Skeleton | OwnJoints:
+    """The skeleton that a request asks for; the bundle's where it asks for none.
+
+    Raises:
+        UnknownSkeletonError: no standard skeleton has this name.
+    """
+    if isinstance(asked, OwnJoints):
+        return asked
+    if asked is None or asked == manifest.skeleton.name:
+        return manifest.skeleton.skeleton()
+    return standard_skeleton(asked)
 
 
 def sent_order(skeleton: Skeleton) -> tuple[int, ...]:

@@ -49,7 +49,11 @@ def above(parents: Sequence[int], joint: int, allowed: Mapping[int, object]) -> 
 
 
 def body_of(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> dict[str, np.ndarray]:
-    """The paths of body21's joints that can be told, (T, 3) each, NaN where they were not seen."""
+    """The paths of body21's joints that can be told, (T, 3) each.
+
+    Raises:
+        SkeletonError: A required joint of body21 is missing.
+    """
     weights, known = joint_map(skeleton, BODY21)
     paths: dict[str, np.ndarray] = {}
     for row, joint, is_known in zip(weights, BODY21.joints, known, strict=True):
@@ -67,7 +71,7 @@ def guess_up(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> Up:
     """
     body = body_of(positions, skeleton)
     upwards = _middle(body, "upper_arm") - _middle(body, "foot")
-    mean = np.nan_to_num(np.nanmedian(upwards, axis=0))
+    mean = np.median(upwards, axis=0)
     axis = int(np.abs(mean).argmax())
     return _UPS[axis][int(mean[axis] < 0)]
 
@@ -84,7 +88,7 @@ def leg_length(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> flo
         for side in ("left", "right")
         for upper, lower in (("upper_leg", "lower_leg"), ("lower_leg", "foot"))
     ]
-    return float(np.nanmedian(np.sum(lengths, axis=0))) / 2.0
+    return float(np.median(np.sum(lengths, axis=0))) / 2.0
 
 
 def guess_units(leg: float) -> Units:
