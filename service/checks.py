@@ -10,8 +10,8 @@ from jaxtyping import Float
 from models.motion.axes import UNITS_PER_METRE, Axes
 from models.motion.gaps import filled
 from models.motion.guesses import LEGS_M, body_of, guess_units, guess_up, leg_length
+from models.motion.trees import without_joints
 from service.observation import Seen, sources
-from service.skeletons import without_joints
 
 About = Literal["units", "up", "sides", "joints", "frozen", "limbs", "teleport", "path"]
 

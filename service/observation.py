@@ -11,19 +11,19 @@ from jaxtyping import Bool, Float, Shaped
 
 from models.bundle import Manifest
 from models.motion.axes import Axes
-from models.motion.gaps import at_even_times, even_rate, filled, steadied, trusted
+from models.motion.gaps import MIN_CONFIDENCE, at_even_times, even_rate, filled, steadied, trusted
 from models.motion.kinematics import bone_lengths
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21, Skeleton, SkeletonError, joint_map, resolve_joints
+from models.motion.trees import without_joints
 from service.errors import PosesError, TooFewFramesError, UnknownSkeletonError
 from service.person import check_person
 from service.poses import confidence_array, poses_array, times_array
-from service.skeletons import OwnJoints, own_skeleton, sent_order, without_joints
+from service.skeletons import OwnJoints, own_skeleton, sent_order
 
 Source = Literal["observed", "derived", "imputed"]
 
 MIN_FPS, MAX_FPS = 5.0, 300.0
-MIN_CONFIDENCE = 0.3  # below, a joint counts as not seen, unless it never reaches it
 LONG_GAP_S = 0.25
 MAX_BONES = 3  # of body21, that move as one
 MAX_HEIGHT_M = 10.0  # of the lowest joint over z = 0; above, it is brought down to the ground
@@ -243,7 +243,7 @@ def _whole(recent: Seen, fps: float) -> tuple[Float[np.ndarray, "T J 3"], list[s
     world, warnings = recent.world.copy(), []
     names, parents, frames = recent.skeleton.joints, recent.skeleton.parents, len(recent.world)
     if recent.confidence is not None:
-        world[~trusted(recent.confidence, MIN_CONFIDENCE)] = np.nan
+        world[~trusted(recent.confidence)] = np.nan
         doubted = (recent.confidence < MIN_CONFIDENCE).all(axis=0)
         warnings += [
             f"confidence: {names[j]} is below {MIN_CONFIDENCE} in every frame used; it was taken "

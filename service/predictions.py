@@ -35,7 +35,7 @@ from service.errors import (
     UnknownRequestError,
 )
 from service.futures import num_frames
-from service.media import DOCUMENTS, MSGPACK, NPZ, STREAMS, accepted
+from service.media import BVH, DOCUMENTS, GLB, MOTIONS, MSGPACK, NPZ, STREAMS, ZIP, accepted
 from service.observation import Observation, read_observation
 from service.problems import declared
 from service.quantiles import check_levels
@@ -88,15 +88,20 @@ _BINARY = {
         "as JSON"
     ),
 }
+_FILES = {
+    BVH: _described("the future as a BVH file, Y-up, centimetres, where num_samples is 1"),
+    GLB: _described("the future as an animated glTF file where num_samples is 1"),
+    ZIP: _described("where a file was accepted and num_samples is more: one for each future"),
+}
 _EVENTS = _described(
     "accepted {id, model, seed, steps.of}, preview {id, steps, futures} after each step, final "
     "(the plain JSON), end; or an error instead of what is left; a stream without end is not "
     "complete"
 )
 _BODIES = {"requestBody": {"content": _BINARY}}
-_ANSWERS: dict[int | str, dict[str, Any]] = {200: {"content": _BINARY}}
+_ANSWERS: dict[int | str, dict[str, Any]] = {200: {"content": _BINARY | _FILES}}
 _ANSWERS_OR_EVENTS: dict[int | str, dict[str, Any]] = {
-    200: {"content": _BINARY | dict.fromkeys(STREAMS, _EVENTS)}
+    200: {"content": _BINARY | _FILES | dict.fromkeys(STREAMS, _EVENTS)}
 }
 
 
@@ -122,11 +127,12 @@ async def predict(
     timeout_s: _TimeoutHeader = None,
 ) -> Response:
     """N futures of the person in the poses, in the caller's world, skeleton and frame rate."""
-    media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *STREAMS))
+    media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *STREAMS, *MOTIONS))
     manifest, worker = catalog.ready(body.model, with_actions=False)
     horizon = _horizon(body, settings, manifest)
     frames = horizon or manifest.horizon
     _check_limits(body, settings)
+    _check_returned(body, media_type)
     observation = await _observation(body, manifest)
     _check_answer(body, settings, manifest, frames=frames, fps=observation.caller.fps)
     if "quantiles" in body.returned:
@@ -183,7 +189,7 @@ async def predict_actions(
     timeout_s: _TimeoutHeader = None,
 ) -> Response:
     """N futures of the person in the poses, who performs the actions one after the other."""
-    media_type = accepted(http.headers.get("accept", ""), DOCUMENTS)
+    media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *MOTIONS))
     manifest, worker = catalog.ready(body.model, with_actions=True)
     indices = action_indices(body.actions, manifest)
     longest = max_frames(body.max_seconds_per_action, manifest)
@@ -315,8 +321,11 @@ async def _answered(
     work = worker.predict(request, answer.final, request_key=answer.id)
     content = await unless_gone(http, work)
     ended()
+    headers = {"Content-Type": answer.media_type}
+    if answer.media_type in MOTIONS:
+        content, headers = await asyncio.to_thread(answer.files)
     timing = ", ".join(f"{name};dur={ms}" for name, ms in answer.milliseconds().items())
-    return Response(content, media_type=answer.media_type, headers={"Server-Timing": timing})
+    return Response(content, headers=headers | {"Server-Timing": timing})
 
 
 async def _streamed(
@@ -376,6 +385,15 @@ def _check_limits(body: schemas.ObservedMotion, settings: Settings) -> None:
             pointer="/poses",
             found=f"{len(body.poses)} frames",
             expected=f"this server takes at most {settings.max_frames}; send the last ones",
+        )
+
+
+def _check_returned(body: schemas.PredictRequest, media_type: str) -> None:
+    if media_type in MOTIONS and "futures" not in body.returned:
+        raise FieldError(
+            pointer="/return",
+            found=", ".join(body.returned),
+            expected=f"{media_type} holds futures, so they must be among what is returned",
         )
 
 

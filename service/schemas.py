@@ -6,12 +6,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, InstanceOf, Tag, WithJsonSchema
 
 from models.motion.axes import Axes, Handed, Units, Up
+from models.motion.gaps import MIN_CONFIDENCE
 from models.motion.standards import STANDARDS
 from service.checks import About
 from service.engine.trajectory import StoppedBy
 from service.example import ACTIONS_EXAMPLE, EXAMPLE
 from service.futures import BoneLengths
-from service.observation import MAX_FPS, MIN_CONFIDENCE, MIN_FPS, Source
+from service.observation import MAX_FPS, MIN_FPS, Source
 from service.quantiles import DEFAULT_LEVELS
 from service.skeletons import OwnJoints
 
@@ -235,7 +236,6 @@ class FileObservation(_Body):
     parents: list[int] = Field(description="index of each joint's parent, -1 for the root")
     start_s: float = Field(description="of the first frame in the file")
     duration_s: float = Field(description="of the whole file")
-    warnings: list[str]
 
 
 class ValidationFinding(_Body):

@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from models.bundle import Manifest
-from models.motion.guesses import above, guessed_parents
 from models.motion.skeleton import (
     SENT_ORDERS,
     SKELETONS,
@@ -16,6 +15,7 @@ from models.motion.skeleton import (
     in_tree_order,
     skeleton_from_names,
 )
+from models.motion.trees import guessed_parents
 from service.errors import UnknownSkeletonError
 
 
@@ -84,19 +84,3 @@ def own_skeleton(
             found=f"{len(own.joints)} joints that do not make a body",
             expected=str(error).rstrip("."),
         ) from error
-
-
-def without_joints(skeleton: Skeleton, seen: Bool[np.ndarray, "J"]) -> Skeleton:
-    """The skeleton of the joints that were seen; children of the others move up the tree."""
-    kept = [int(joint) for joint in np.flatnonzero(seen)]
-    if len(kept) == skeleton.num_joints:
-        return skeleton
-    place = {joint: i for i, joint in enumerate(kept)}
-    names = [skeleton.joints[joint] for joint in kept]
-    return Skeleton(
-        name=skeleton.name,
-        joints=tuple(names),
-        parents=tuple(place.get(above(skeleton.parents, joint, place), 0) if i else -1
-                      for i, joint in enumerate(kept)),
-        mapping=tuple((own, body) for own, body in skeleton.mapping if own in names),
-    )  # fmt: skip

@@ -5,6 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from models.motion.motion import Motion
+from models.motion.trees import without_joints
+
+MIN_CONFIDENCE = 0.3  # below, a joint counts as not seen
 STIFFNESS = 0.1  # of `steadied`, at 30 frames per second
 
 
@@ -68,9 +72,9 @@ def steadied(
     return np.moveaxis(np.linalg.solve(system, wanted), 0, 1)
 
 
-def trusted(confidence: Float[np.ndarray, "T J"], least: float) -> Bool[np.ndarray, "T J"]:
-    """Where a joint is trusted at least so much; everywhere where it never is."""
-    enough = confidence >= least
+def trusted(confidence: Float[np.ndarray, "T J"]) -> Bool[np.ndarray, "T J"]:
+    """Where joints are worth using; for one that never is, everywhere: better than nothing."""
+    enough = confidence >= MIN_CONFIDENCE
     return enough | ~enough.any(axis=0)
 
 
@@ -78,3 +82,15 @@ def _interpolated(
     at: Float[np.ndarray, "N"], times: Float[np.ndarray, "P"], values: Float[np.ndarray, "P D"]
 ) -> Float[np.ndarray, "N D"]:
     return np.stack([np.interp(at, times, column) for column in values.T], axis=-1)
+
+
+def without_gaps(motion: Motion) -> Motion:
+    """The motion with its gaps closed as by `filled`; joints that were never seen are left out."""
+    seen = np.isfinite(motion.positions[:, :, 0])
+    if seen.all():
+        return motion
+    ever = seen.any(axis=0)
+    skeleton = without_joints(motion.skeleton, ever)
+    times = np.arange(motion.num_frames) / motion.fps
+    whole = filled(motion.positions[:, ever], times, skeleton.parents)
+    return Motion(name=motion.name, skeleton=skeleton, positions=whole, fps=motion.fps)

@@ -1,51 +1,16 @@
-"""What positions alone tell of a person: which joint hangs on which, what is up, and the unit."""
+"""What positions alone tell of a person: which axis is up, and how long a unit is."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from jaxtyping import Float
 
 from models.motion.axes import UNITS_PER_METRE, Units, Up
-from models.motion.skeleton import BODY21, Skeleton, joint_map, resolve_joints
+from models.motion.skeleton import BODY21, Skeleton, joint_map
 
 LEGS_M = (0.4, 1.15)  # hip to ankle, from a child of four to a very tall adult
 _UPS: tuple[tuple[Up, Up], ...] = (("x", "-x"), ("y", "-y"), ("z", "-z"))
-
-
-def guessed_parents(skeleton: Skeleton, pose: Float[np.ndarray, "J 3"]) -> tuple[int, ...]:
-    """A parent for each joint, as an index into the skeleton's joints; the root has -1.
-
-    A joint that body21 knows hangs on the joint before it in the body, and any other on the known
-    joint nearest to it in ``pose``, where NaN is a joint that was not seen.
-    """
-    index = {joint: i for i, joint in enumerate(skeleton.joints)}
-    # In body21's order, which puts parents first: {its joint: the skeleton's}.
-    known = {
-        BODY21.index(body21): index[joint]
-        for body21, joint in sorted(
-            resolve_joints(skeleton).items(), key=lambda pair: BODY21.index(pair[0])
-        )
-    }
-    root = next(iter(known.values()))
-    parents = {
-        own: known.get(above(BODY21.parents, body21, known), root) for body21, own in known.items()
-    }
-    parents[root] = -1
-    candidates = list(parents)
-    for joint in set(range(skeleton.num_joints)) - parents.keys():
-        distances = np.linalg.norm(pose[candidates] - pose[joint], axis=-1)
-        seen = bool(np.isfinite(distances).any())
-        parents[joint] = candidates[int(np.nanargmin(distances))] if seen else root
-    return tuple(parents[joint] for joint in range(skeleton.num_joints))
-
-
-def above(parents: Sequence[int], joint: int, allowed: Mapping[int, object]) -> int:
-    """The nearest joint over this one in the tree that is allowed, or -1."""
-    parent = parents[joint]
-    while parent >= 0 and parent not in allowed:
-        parent = parents[parent]
-    return parent
 
 
 def body_of(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> dict[str, np.ndarray]:
