@@ -9,7 +9,7 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from service import predictions
+from service import files, predictions, validation
 from service.catalog import Catalog
 from service.guard import Guard
 from service.metrics import Metrics
@@ -69,6 +69,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.draining = False
     app.state.streams = set()
     app.include_router(predictions.router)
+    app.include_router(files.router)
+    app.include_router(validation.router)
     app.include_router(router)
     app.include_router(health)
     add_problem_responses(app)
