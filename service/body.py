@@ -25,7 +25,7 @@ class BodyRoute(APIRoute):
         async def checked(request: Request) -> Response:
             media_type = sent(request.headers.get("content-type", ""))
             limit: int = request.app.state.settings.max_body_bytes
-            body = await _read(request, limit=limit)
+            body = await read_body(request, limit=limit)
             if len(body) > BIG_BODY_BYTES:
                 content = await to_thread(decoded, body, media_type, limit=limit)
             else:
@@ -52,7 +52,12 @@ class _Parsed(Request):
         return self._content
 
 
-async def _read(request: Request, *, limit: int) -> bytes:
+async def read_body(request: Request, *, limit: int) -> bytes:
+    """The bytes of a body.
+
+    Raises:
+        BodyTooLargeError: there are more than ``limit``.
+    """
     declared = request.headers.get("content-length", "")
     size = int(declared) if declared.isdecimal() else 0
     chunks = []

@@ -17,7 +17,8 @@ ServiceError                       status  problem
 │   │   ├── UnknownSkeletonError   422     unknown-skeleton
 │   │   ├── UnknownModelError      422     unknown-model (404 in a path)
 │   │   ├── UnsuitableModelError   422     unsuitable-model: it performs actions, or performs none
-│   │   └── UnknownActionError     422     unknown-action
+│   │   ├── UnknownActionError     422     unknown-action
+│   │   └── MotionFileError        422     unreadable-file: it is damaged, or of a kind not read
 │   └── RateLimitedError           429     rate-limited: this caller asks too often
 ├── OverloadedError                429     overloaded: the queue is full
 ├── UnavailableError               503     unavailable: loading, stopping or refused bundle
@@ -184,6 +185,13 @@ class UnknownActionError(FieldError):
 
     slug = "unknown-action"
     title = "The action is not known"
+
+
+class MotionFileError(FieldError):
+    """The body is no motion file that can be read."""
+
+    slug = "unreadable-file"
+    title = "The file cannot be read"
 
 
 class RateLimitedError(InputError):

@@ -171,6 +171,20 @@ class PredictActionsRequest(ObservedMotion):
     )
 
 
+class FileObservation(_Body):
+    """The motion of a file, in the fields of a request, and what is worth knowing of it."""
+
+    name: str
+    poses: Annotated[list[Any], WithJsonSchema(_POSES_SCHEMA)]
+    skeleton: SkeletonBody
+    axes: AxesBody
+    fps: float
+    parents: list[int] = Field(description="index of each joint's parent, -1 for the root")
+    start_s: float = Field(description="of the first frame in the file")
+    duration_s: float = Field(description="of the whole file")
+    warnings: list[str]
+
+
 class ModelRef(_Body):
     """Which bundle answered."""
 

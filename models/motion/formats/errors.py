@@ -15,6 +15,8 @@ class FormatError(ValueError):
 
     def __init__(self, where: str, *, found: str, right: str) -> None:
         super().__init__(f"{where}: found {found}; {right}.")
+        self.found = found
+        self.right = right
 
 
 class UnsupportedFileError(FormatError):
