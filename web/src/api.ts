@@ -155,3 +155,7 @@ async function* lines(stream: ReadableStream<BufferSource>): AsyncGenerator<Line
     for (const part of parts) if (part) yield JSON.parse(part) as Line;
   }
 }
+
+/** What the server finds in a motion file. */
+export const observations = (file: File | Blob, name: string) =>
+  told(api.observations({ body: file, query: { name } }));

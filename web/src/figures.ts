@@ -7,15 +7,20 @@ import {
   InstancedMesh,
   LatheGeometry,
   type Material,
+  Matrix4,
   SphereGeometry,
   Vector2,
+  Vector3,
 } from "three";
 import { headOf, type Skeleton } from "./skeleton";
 
 const SPINDLE = spindle(10, 8);
 const BALL = new SphereGeometry(1, 14, 10);
 const THICKNESS = { least: 0.013, most: 0.058, ofLength: 0.17 };
+const TORSO = [0.3, 0.19]; // half its width and depth, of its length
 const HEAD_M = 0.1;
+const LOOSE_M = 0.03; // a joint without a bone
+const MATRIX = new Matrix4();
 
 export interface FiguresOptions {
   material: Material;
@@ -31,6 +36,7 @@ export class Figures {
   private readonly options: Required<FiguresOptions>;
   private bones: [child: number, parent: number][] = [];
   private head: { joint: number; from: number } | null = null;
+  private torso: Torso | null = null;
   private loose: number[] = [];
   private spindles: InstancedMesh | null = null;
   private balls: InstancedMesh | null = null;
@@ -46,6 +52,7 @@ export class Figures {
     this.bones = parents.flatMap((parent, joint) => (parent >= 0 ? [[joint, parent]] : []));
     const head = headOf(joints);
     this.head = head >= 0 && parents[head] >= 0 ? { joint: head, from: parents[head] } : null;
+    this.torso = this.head && torsoOf(parents, this.head.from);
     const jointed = new Set(this.bones.flat());
     this.loose = parents.flatMap((_, joint) => (jointed.has(joint) ? [] : [joint]));
     this.capacity = 0;
@@ -59,7 +66,8 @@ export class Figures {
 
   add(pose: Float32Array, color: Color): void {
     for (const [child, parent] of this.bones) this.addBone(pose, child, parent, color);
-    for (const joint of this.loose) this.addBall(pose, joint, 0, 0, 0, 0.03, color);
+    if (this.torso) this.addTorso(pose, this.torso, color);
+    for (const joint of this.loose) this.addBall(pose, joint, new Vector3(), LOOSE_M, color);
     if (this.head) this.addHead(pose, this.head.joint, this.head.from, color);
   }
 
@@ -91,68 +99,85 @@ export class Figures {
       this.group.add(mesh);
       return mesh;
     };
-    this.spindles = make(SPINDLE, this.bones.length * this.capacity);
+    this.spindles = make(SPINDLE, (this.bones.length + 1) * this.capacity);
     this.balls = make(BALL, (this.loose.length + 1) * this.capacity);
   }
 
   private addBone(pose: Float32Array, child: number, parent: number, color: Color): void {
-    const from = parent * 3;
-    const to = child * 3;
-    const x = pose[to] - pose[from];
-    const y = pose[to + 1] - pose[from + 1];
-    const z = pose[to + 2] - pose[from + 2];
-    const length = Math.hypot(x, y, z);
-    if (!(length > 1e-4) || !this.spindles) return; // an unseen joint is NaN
+    const along = between(pose, parent, child);
+    const length = along.length();
+    if (!(length > 1e-4)) return; // an unseen joint is NaN
     const { least, most, ofLength } = THICKNESS;
     const wide = Math.min(Math.max(length * ofLength, least), most) * this.options.thickness;
-    const reach = length + wide; // half a thickness beyond each joint, so that limbs join
-    const [dx, dy, dz] = [x / length, y / length, z / length];
-    // Any two axes across the bone: the first from the world axis that it is least along.
-    const along = Math.abs(dz) < 0.9;
-    const [ux, uy, uz] = along ? [-dy, dx, 0] : [0, -dz, dy];
-    const norm = wide / Math.hypot(ux, uy, uz);
-    const [ax, ay, az] = [ux * norm, uy * norm, uz * norm];
-    const [bx, by, bz] = [dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax];
-    // biome-ignore format: the columns of the matrix
-    this.spindles.instanceMatrix.array.set([
-      bx, by, bz, 0,
-      dx * reach, dy * reach, dz * reach, 0,
-      ax, ay, az, 0,
-      pose[from] - dx * wide * 0.5, pose[from + 1] - dy * wide * 0.5, pose[from + 2] - dz * wide * 0.5, 1,
-    ], this.numSpindles * 16);
+    // Any axis across the bone: that of the world which it is least along.
+    const across = new Vector3(0, 0, 1);
+    if (Math.abs(along.z) > 0.9 * length) across.set(1, 0, 0);
+    this.addSpindle(pose, parent, along, across, [wide, wide], wide, color);
+  }
+
+  private addTorso(pose: Float32Array, torso: Torso, color: Color): void {
+    const along = between(pose, torso.from, torso.to);
+    const sideways = between(pose, ...torso.hips);
+    if (!(along.length() > 1e-4) || !(sideways.length() > 1e-4)) return;
+    const [wide, deep] = TORSO.map((share) => share * along.length() * this.options.thickness);
+    this.addSpindle(pose, torso.from, along, sideways, [wide, deep], deep, color);
+  }
+
+  /** A spindle from a joint along a vector, a little beyond both ends so that limbs join. */
+  private addSpindle(
+    pose: Float32Array,
+    from: number,
+    along: Vector3,
+    across: Vector3,
+    [wide, deep]: number[],
+    beyond: number,
+    color: Color,
+  ): void {
+    if (!this.spindles) return;
+    const direction = along.clone().normalize();
+    const z = new Vector3().crossVectors(across, direction).normalize();
+    const x = new Vector3().crossVectors(direction, z);
+    const reach = along.length() + beyond;
+    const start = new Vector3(...pose.subarray(from * 3, from * 3 + 3)).addScaledVector(direction, -beyond / 2);
+    MATRIX.makeBasis(x.multiplyScalar(wide), direction.multiplyScalar(reach), z.multiplyScalar(deep));
+    this.spindles.setMatrixAt(this.numSpindles, MATRIX.setPosition(start));
     this.spindles.setColorAt(this.numSpindles++, color);
   }
 
   private addHead(pose: Float32Array, joint: number, from: number, color: Color): void {
-    const [a, b] = [from * 3, joint * 3];
-    const [x, y, z] = [pose[b] - pose[a], pose[b + 1] - pose[a + 1], pose[b + 2] - pose[a + 2]];
-    const length = Math.hypot(x, y, z);
-    if (!(length > 1e-4)) return;
-    const up = (0.6 * HEAD_M) / length;
-    this.addBall(pose, joint, x * up, y * up, z * up, HEAD_M, color);
+    const up = between(pose, from, joint);
+    if (!(up.length() > 1e-4)) return;
+    this.addBall(pose, joint, up.setLength(0.6 * HEAD_M), HEAD_M, color);
   }
 
-  private addBall(
-    pose: Float32Array,
-    joint: number,
-    x: number,
-    y: number,
-    z: number,
-    radius: number,
-    color: Color,
-  ): void {
-    const at = joint * 3;
-    if (!this.balls || Number.isNaN(pose[at])) return;
+  private addBall(pose: Float32Array, joint: number, beyond: Vector3, radius: number, color: Color): void {
+    const at = new Vector3(...pose.subarray(joint * 3, joint * 3 + 3)).add(beyond);
+    if (!this.balls || Number.isNaN(at.x)) return;
     const wide = radius * (0.75 + 0.25 * this.options.thickness);
-    // biome-ignore format: the columns of the matrix
-    this.balls.instanceMatrix.array.set([
-      wide, 0, 0, 0,
-      0, wide, 0, 0,
-      0, 0, wide * 1.15, 0,
-      pose[at] + x, pose[at + 1] + y, pose[at + 2] + z, 1,
-    ], this.numBalls * 16);
+    MATRIX.makeScale(wide, wide, wide * 1.15).setPosition(at);
+    this.balls.setMatrixAt(this.numBalls, MATRIX);
     this.balls.setColorAt(this.numBalls++, color);
   }
+}
+
+interface Torso {
+  hips: [number, number];
+  from: number;
+  to: number;
+}
+
+/** From the root to the neck, turned as the hips are: the root's other children. */
+function torsoOf(parents: number[], neck: number): Torso | null {
+  const spine = new Set<number>();
+  for (let joint = neck; joint >= 0; joint = parents[joint]) spine.add(joint);
+  const root = [...spine].pop() ?? neck;
+  const hips = parents.flatMap((parent, joint) => (parent === root && !spine.has(joint) ? [joint] : []));
+  return hips.length >= 2 && root !== neck ? { hips: [hips[0], hips[1]], from: root, to: neck } : null;
+}
+
+function between(pose: Float32Array, from: number, to: number): Vector3 {
+  const [a, b] = [from * 3, to * 3];
+  return new Vector3(pose[b] - pose[a], pose[b + 1] - pose[a + 1], pose[b + 2] - pose[a + 2]);
 }
 
 /** A limb of length 1 along +Y and of radius 1: full in the middle, round at its ends. */

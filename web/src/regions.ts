@@ -5,11 +5,13 @@ import {
   DynamicDrawUsage,
   Group,
   InstancedMesh,
+  Matrix4,
   NotEqualStencilFunc,
   ReplaceStencilOp,
   MeshBasicMaterial,
   ShaderMaterial,
   SphereGeometry,
+  Vector3,
 } from "three";
 import type { Track } from "./motion";
 
@@ -21,20 +23,20 @@ export interface Regions {
   radius: Float32Array;
 }
 
-const BALL = new SphereGeometry(1, 24, 16);
-const SWEPT = new SphereGeometry(1, 14, 10);
+const BALL = new SphereGeometry(1, 48, 32);
+const SWEPT = new SphereGeometry(1, 20, 14);
+const MATRIX = new Matrix4();
 const EVERY = 2; // frames, of those swept
 
 export class RegionBalls {
   readonly group = new Group();
   private readonly balls: InstancedMesh[] = [];
-  private readonly tubes: InstancedMesh[] = [];
+  private readonly tube: InstancedMesh;
 
   constructor(numLevels: number, maxBalls: number, maxSwept: number) {
+    this.tube = this.added(SWEPT, sweptMaterial(), maxSwept, 5);
     for (let level = 0; level < numLevels; level++) {
-      const inner = level === 0;
-      this.tubes.push(this.added(SWEPT, sweptMaterial(level), maxSwept, 6 - level));
-      this.balls.push(this.added(BALL, rimMaterial(inner ? 0.5 : 0.3), maxBalls, 8 - level));
+      this.balls.push(this.added(BALL, rimMaterial(level === 0 ? 0.75 : 0.4), maxBalls, 8 - level));
     }
   }
 
@@ -42,34 +44,32 @@ export class RegionBalls {
     for (const { material } of this.balls) {
       (material as ShaderMaterial).uniforms.color.value = color;
     }
-    for (const { material } of this.tubes) (material as MeshBasicMaterial).color = color;
+    (this.tube.material as MeshBasicMaterial).color = color;
   }
 
   hide(): void {
     this.group.visible = false;
   }
 
-  /** The balls of some joints at a frame of the futures, and what they went through until then. */
+  /** The balls of some joints at a frame, and what those of the first level went through. */
   draw({ centre, radius }: Regions, joints: number[], frame: number): void {
     const last = Math.min(Math.max(Math.round(frame), 0), centre.frames - 1);
+    const put = (mesh: InstancedMesh, level: number, when: number, joint: number): void => {
+      const r = radius[(level * centre.frames + when) * centre.joints + joint];
+      const at = (when * centre.joints + joint) * 3;
+      MATRIX.makeScale(r, r, r).setPosition(new Vector3(...centre.data.subarray(at, at + 3)));
+      mesh.setMatrixAt(mesh.count++, MATRIX);
+      mesh.instanceMatrix.needsUpdate = true;
+    };
     this.group.visible = true;
-    for (let level = 0; level < this.balls.length; level++) {
-      const at = (mesh: InstancedMesh, index: number, when: number, joint: number): void => {
-        const r = radius[(level * centre.frames + when) * centre.joints + joint];
-        const p = (when * centre.joints + joint) * 3;
-        const [x, y, z] = [centre.data[p], centre.data[p + 1], centre.data[p + 2]];
-        mesh.instanceMatrix.array.set([r, 0, 0, 0, 0, r, 0, 0, 0, 0, r, 0, x, y, z, 1], index * 16);
-      };
-      const [balls, tubes] = [this.balls[level], this.tubes[level]];
-      joints.forEach((joint, index) => at(balls, index, last, joint));
-      balls.count = joints.length;
-      let swept = 0;
-      for (let when = last; when >= 0; when -= EVERY) {
-        for (const joint of joints) at(tubes, swept++, when, joint);
-      }
-      tubes.count = swept;
-      for (const mesh of [balls, tubes]) mesh.instanceMatrix.needsUpdate = true;
+    this.tube.count = 0;
+    for (let when = last; when >= 0; when -= EVERY) {
+      for (const joint of joints) put(this.tube, 0, when, joint);
     }
+    this.balls.forEach((mesh, level) => {
+      mesh.count = 0;
+      for (const joint of joints) put(mesh, level, last, joint);
+    });
   }
 
   private added(
@@ -89,13 +89,13 @@ export class RegionBalls {
 }
 
 /** One even tint however many balls overlap: each pixel is painted once. */
-function sweptMaterial(level: number): MeshBasicMaterial {
+function sweptMaterial(): MeshBasicMaterial {
   return new MeshBasicMaterial({
     transparent: true,
-    opacity: 0.09,
+    opacity: 0.13,
     depthWrite: false,
     stencilWrite: true,
-    stencilRef: level + 1,
+    stencilRef: 1,
     stencilFunc: NotEqualStencilFunc,
     stencilZPass: ReplaceStencilOp,
   });
@@ -119,7 +119,7 @@ function rimMaterial(opacity: number): ShaderMaterial {
       uniform float opacity;
       varying float facing;
       void main() {
-        gl_FragColor = vec4(color, opacity * (0.12 + 0.88 * pow(1.0 - abs(facing), 3.0)));
+        gl_FragColor = vec4(color, opacity * (0.04 + 0.96 * pow(1.0 - abs(facing), 4.0)));
         #include <colorspace_fragment>
       }`,
   });

@@ -1,5 +1,6 @@
 /** Where motions come from: the demos beside the page, and files that people bring. */
 
+import { zipSync } from "fflate";
 import type { PredictRequest } from "../client";
 import * as api from "./api";
 import { type Axes, METRES_Z_UP, type Motion, type Poses, trackOf } from "./motion";
@@ -29,13 +30,20 @@ export async function demo(name: string): Promise<Motion> {
   return motionOf((await answer.json()) as Observed, name);
 }
 
-/** The motion in a file; JSON in the shape of a request is read here, the rest by the server. */
-export async function fromFile(file: File): Promise<Motion> {
-  if (file.name.toLowerCase().endsWith(".json")) {
-    const found = asObserved(await file.text());
-    if (found) return motionOf(found, file.name);
+/**
+ * The motion in a file, or in files that need each other, such as an .amc and its .asf.
+ *
+ * JSON in the shape of a request is read here, the rest by the server.
+ */
+export async function fromFiles(files: File[]): Promise<Motion> {
+  const [file] = files;
+  if (files.length > 1) {
+    const contents = files.map(async (one) => [one.name, new Uint8Array(await one.arrayBuffer())]);
+    const zip = zipSync(Object.fromEntries(await Promise.all(contents)));
+    return motionOf((await api.observations(new Blob([zip as Uint8Array<ArrayBuffer>]), "motion.zip")) as Observed, file.name);
   }
-  return motionOf((await api.observations(file)) as Observed, file.name);
+  const found = /\.json$/i.test(file.name) ? asObserved(await file.text()) : null;
+  return motionOf(found ?? ((await api.observations(file, file.name)) as Observed), file.name);
 }
 
 function asObserved(text: string): Observed | null {

@@ -1,10 +1,10 @@
 /** The world that bodies stand in: camera, light, ground, and a picture when something changed. */
 
 import {
-  ACESFilmicToneMapping,
   DirectionalLight,
   HemisphereLight,
   Mesh,
+  NeutralToneMapping,
   Object3D,
   PCFShadowMap,
   PerspectiveCamera,
@@ -45,8 +45,8 @@ export class Stage {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.shadowMap.enabled = true;
     this.renderer.shadowMap.type = PCFShadowMap;
-    this.renderer.toneMapping = ACESFilmicToneMapping;
-    this.renderer.toneMappingExposure = 1.15;
+    this.renderer.toneMapping = NeutralToneMapping;
+    this.renderer.toneMappingExposure = 1;
 
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = true;
@@ -108,7 +108,7 @@ export class Stage {
     this.controls.target.copy(at);
     const azimuth = heading + 0.95;
     const portrait = this.camera.aspect < 1 ? 1.25 : 1;
-    const away = 5.2 * portrait;
+    const away = 4.7 * portrait;
     this.camera.position.set(
       at.x + away * Math.cos(azimuth),
       at.y + away * Math.sin(azimuth),

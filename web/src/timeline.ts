@@ -6,6 +6,7 @@ import { Player } from "./player";
 
 const THUMB_PX = 14; // as in style.css; a thumb's middle moves between half of it and the rest
 const NOW_ROW_PX = 20;
+const SECONDS_ROW_PX = 13;
 const BEFORE_S = 1; // of the observation in the loop
 
 export interface TimelineWishes {
@@ -95,7 +96,7 @@ export class Timeline {
     const ink = (name: string) => style.getPropertyValue(name).trim();
     const x = (seconds: number) => THUMB_PX / 2 + (seconds / this.end) * (width - THUMB_PX);
     const [top, now] = [NOW_ROW_PX, x(this.nowSeconds)];
-    const box = height - top;
+    const box = height - top - SECONDS_ROW_PX;
 
     pen.fillStyle = ink("--track");
     pen.beginPath();
@@ -109,8 +110,8 @@ export class Timeline {
     pen.fillRect(x(0), top, now - x(0), box);
     if (this.answer?.segments.length) this.drawSegments(pen, x, top, box, ink);
     else if (this.answer?.regions) this.drawSpread(pen, x, top, box, ink("--accent"));
-    this.drawSeconds(pen, x, height, ink("--faint"));
     pen.restore();
+    this.drawSeconds(pen, x, height, ink("--faint"));
     pen.fillStyle = ink("--accent");
     pen.fillRect(now - 1, top - 4, 2, box + 4);
   }
@@ -119,10 +120,11 @@ export class Timeline {
     pen.fillStyle = faint;
     pen.font = "10px system-ui, sans-serif";
     const every = this.end > 40 ? 10 : this.end > 14 ? 2 : 1;
+    pen.textAlign = "center";
     for (let second = 0; second <= this.end; second += every) {
-      pen.fillRect(x(second), height - 4, 1, 4);
-      if (x(second) + 18 < x(this.end)) pen.fillText(`${second} s`, x(second) + 4, height - 4);
+      pen.fillText(second ? String(second) : "0 s", x(second), height - 2);
     }
+    pen.textAlign = "start";
   }
 
   /** The 90 % region of the root grows with time. */

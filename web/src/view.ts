@@ -44,7 +44,7 @@ export class View {
   });
   private readonly truthMaterial = new MeshBasicMaterial({ wireframe: true, transparent: true, opacity: 0.8 });
   private readonly body = new Figures({ material: this.bodyMaterial, shadow: true });
-  private readonly crowd = new Figures({ material: this.crowdMaterial, thickness: 0.55, renderOrder: 2 });
+  private readonly crowd = new Figures({ material: this.crowdMaterial, thickness: 0.6, renderOrder: 2 });
   private readonly chosen = new Figures({ material: this.chosenMaterial, thickness: 0.8, shadow: true, renderOrder: 3 });
   private readonly truth = new Figures({ material: this.truthMaterial, thickness: 0.95, renderOrder: 4 });
   private readonly path = new Trails({ width: 3.5, opacity: 0.9 });
@@ -133,7 +133,7 @@ export class View {
   private drawFutures(ahead: number | null, centre: Vector3): void {
     const { answer } = this;
     const { chosen, crowd } = ahead === null || !answer ? { chosen: [], crowd: [] } : this.shown();
-    this.crowdMaterial.opacity = Math.min(0.42, 0.14 + 2.2 / Math.max(crowd.length, 1) / 10);
+    this.crowdMaterial.opacity = Math.min(0.5, 0.16 + 2 / Math.max(crowd.length, 1));
     this.crowd.begin(crowd.length);
     this.chosen.begin(chosen.length);
     const mean = new Vector3();
