@@ -25,16 +25,16 @@ DEMOS = {  # file: (seed, actions)
 
 
 def main(url: str) -> None:
-    """Write all of them."""
+    """Write all of them; the first frames, in which nobody moves, are left out."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     standing = np.array(EXAMPLE["poses"])
     with Client(url) as client:
         for name, (seed, actions) in DEMOS.items():
             answer = client.predict_actions(standing, actions, fps=30, num_samples=1, seed=seed, max_seconds_per_action=3)
-            poses = np.concatenate([standing, answer.futures[0]]).round(3)
+            poses = np.concatenate([standing[10:], answer.futures[0]]).round(3)
             motion = {"name": name, "skeleton": "body21", "fps": 30, "poses": poses.tolist()}
             (FOLDER / f"{name}.json").write_bytes(orjson.dumps(motion))
-            print(name, len(poses), [(s.action, s.end) for s in answer.segments[0]])  # noqa: T201
+            print(name, len(poses), [(s.action, s.end) for s in answer.segments[0]])
 
 
 main(sys.argv[1])

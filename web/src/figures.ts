@@ -51,7 +51,7 @@ export class Figures {
   setSkeleton({ joints, parents }: Skeleton): void {
     this.bones = parents.flatMap((parent, joint) => (parent >= 0 ? [[joint, parent]] : []));
     const head = headOf(joints);
-    this.head = head >= 0 && parents[head] >= 0 ? { joint: head, from: parents[head] } : null;
+    this.head = head >= 0 ? { joint: head, from: parents[head] } : null;
     this.torso = this.head && torsoOf(parents, this.head.from);
     const jointed = new Set(this.bones.flat());
     this.loose = parents.flatMap((_, joint) => (jointed.has(joint) ? [] : [joint]));
@@ -145,9 +145,8 @@ export class Figures {
   }
 
   private addHead(pose: Float32Array, joint: number, from: number, color: Color): void {
-    const up = between(pose, from, joint);
-    if (!(up.length() > 1e-4)) return;
-    this.addBall(pose, joint, up.setLength(0.6 * HEAD_M), HEAD_M, color);
+    const up = from < 0 ? new Vector3() : between(pose, from, joint).setLength(0.6 * HEAD_M);
+    this.addBall(pose, joint, up, HEAD_M, color);
   }
 
   private addBall(pose: Float32Array, joint: number, beyond: Vector3, radius: number, color: Color): void {
@@ -166,7 +165,7 @@ interface Torso {
   to: number;
 }
 
-/** From the root to the neck, turned as the hips are: the root's other children. */
+/** From the root to the neck, where the head has one, turned as the hips are: the root's other children. */
 function torsoOf(parents: number[], neck: number): Torso | null {
   const spine = new Set<number>();
   for (let joint = neck; joint >= 0; joint = parents[joint]) spine.add(joint);

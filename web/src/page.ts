@@ -1,12 +1,16 @@
 /** The page: what is chosen on it, what is asked of the server, and what is shown of the answer. */
 
-import type { PredictActionsRequest, PredictRequest } from "../client";
+import type { PredictActionsRequest } from "../client";
 import * as api from "./api";
+import { adaptTo, look, MIN_QUANTILE_SAMPLES, options, performing, questionOf, showSliders } from "./choices";
 import { button, element, input, made } from "./dom";
+import { listenForFiles } from "./files";
+import { listenForKeys } from "./keys";
 import { latest } from "./latest";
 import { Models } from "./models";
 import { ModeList } from "./modes";
-import type { Motion } from "./motion";
+import type { Axes, Motion } from "./motion";
+import { Notice } from "./notice";
 import { onPaletteChange, readPalette } from "./palette";
 import { Script } from "./script";
 import { Server } from "./server";
@@ -15,17 +19,17 @@ import { Stage } from "./stage";
 import { asCurl, asPython, type Question, save } from "./take";
 import { Timeline } from "./timeline";
 import { type Solo, View } from "./view";
+import { Webcam } from "./webcam";
 
 const FIRST_NOW_S = 2.2; // into a demo
-const MARGIN_S = 0.25; // observed beyond what the model sees
-const MIN_QUANTILE_SAMPLES = 10;
 const PREVIEW_MS = 110; // at least, for a step to be seen
+const LIVE_AHEAD_S = 0.6; // how far into the future the page looks with the webcam
 
 let motion: Motion | null = null;
 let now = 0;
 let answer: api.Answer | null = null;
+let webcam: Webcam | null = null;
 let solo: Solo = null;
-const numSamples = { predict: 20, perform: 8 }; // an action is long, and so is an answer
 let defaults: { predict: string | null; perform: string | null } = { predict: null, perform: null };
 
 const script = new Script(() => {
@@ -38,17 +42,21 @@ const stage = new Stage(element<HTMLCanvasElement>("canvas"), tick);
 const view = new View(stage, script.colourOf);
 const timeline = new Timeline({ seek, setNow }, script.colourOf);
 const models = new Models(fail, () => {
-  adaptToModel();
+  adaptTo(models.current);
   void ask();
 });
 const modes = new ModeList((chosen) => {
   solo = chosen;
   showLook();
 });
+const notice = new Notice((key) => {
+  api.useKey(key);
+  void begin();
+});
 const server = new Server(() => void begin());
 
-const performing = () => input("ask-perform").checked;
 const ask = latest(() => answered(false));
+const question = () => motion && questionOf(motion, now, models.current, script.wanted);
 
 /** Called whenever the server has come, or come back. */
 async function begin(): Promise<void> {
@@ -67,30 +75,58 @@ async function begin(): Promise<void> {
 }
 
 function offerModels(): void {
-  input("num-samples").value = String(numSamples[performing() ? "perform" : "predict"]);
   models.offer(performing(), performing() ? defaults.perform : defaults.predict);
-  adaptToModel();
+  adaptTo(models.current);
 }
 
-/** Let the controls be those of the question and the model. */
-function adaptToModel(): void {
-  element("script-box").hidden = !performing();
-  for (const control of document.querySelectorAll<HTMLElement>(".predict-only")) {
-    control.hidden = performing();
+/** Watch the webcam, or stop watching it. */
+async function watch(): Promise<void> {
+  if (webcam) return stopWatching();
+  webcam = new Webcam();
+  button("webcam").setAttribute("aria-pressed", "true");
+  input("ask-predict").click();
+  try {
+    await webcam.start(element<HTMLVideoElement>("video"), options(models.current), {
+      moved: sawFrame,
+      answered: (found, axes: Axes) => show(api.answerOf(found, axes, performance.now()), now),
+      waiting: (text) => (element("timing").textContent = text),
+      failed: fail,
+    });
+  } catch (error) {
+    stopWatching();
+    fail(error);
   }
-  const steps = input("num-steps");
-  const most = models.current?.num_steps ?? 0;
-  const all = steps.value === steps.max;
-  steps.disabled = button("denoise").disabled = most < 2;
-  steps.max = String(Math.max(most, 1));
-  if (all || Number(steps.value) > most) steps.value = steps.max;
-  showSliders();
+}
+
+function stopWatching(): void {
+  webcam?.stop();
+  webcam = null;
+  button("webcam").setAttribute("aria-pressed", "false");
+}
+
+/** A frame of the webcam, which is now. */
+function sawFrame(found: Motion): void {
+  const first = motion?.name !== found.name;
+  const ahead = first ? LIVE_AHEAD_S : timeline.player.time - timeline.nowSeconds;
+  if (first) answer = null;
+  motion = found;
+  now = found.track.frames - 1;
+  timeline.player.playing = false;
+  timeline.set({ fps: found.fps, frames: found.track.frames }, now, answer);
+  timeline.player.time = timeline.nowSeconds + ahead;
+  if (first) {
+    element("motion-text").textContent = "You, as the camera sees you; nothing is stored.";
+    view.setMotion(found, now);
+    showPlaying();
+  } else view.replaceMotion(found, now);
+  redraw();
 }
 
 /** Show another motion; now is where most models have seen enough, or where a demo is alive. */
 async function load(source: () => Promise<Motion>): Promise<void> {
   try {
     const found = await source();
+    stopWatching();
     motion = found;
     answer = null;
     now = firstNow(found);
@@ -103,7 +139,7 @@ async function load(source: () => Promise<Motion>): Promise<void> {
     for (const chip of element("demos").children) {
       chip.setAttribute("aria-pressed", String((chip as HTMLElement).dataset.demo === found.name));
     }
-    hideNotice();
+    notice.hide();
     await ask();
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) timeline.player.playing = true;
     else seek(timeline.nowSeconds + 1);
@@ -118,38 +154,13 @@ function firstNow({ track, fps }: Motion): number {
   return Math.min(last, Math.max(Math.round(FIRST_NOW_S * fps), Math.round(last * 0.3)));
 }
 
-/** The question that the page asks now. */
-function question(): Question | null {
-  const model = models.current;
-  if (!motion || !model) return null;
-  const sees = (model.num_observed ?? 1) / (model.fps ?? 30) + MARGIN_S;
-  const from = Math.max(0, now + 1 - Math.ceil(sees * motion.fps));
-  const about = {
-    poses: motion.poses.slice(from, now + 1),
-    ...(motion.named === undefined ? {} : { skeleton: motion.named }),
-    axes: motion.axes,
-    fps: motion.fps,
-    num_samples: Number(input("num-samples").value),
-    seed: Number(input("seed").value),
-    model: model.name,
-  };
-  if (performing()) {
-    const body: PredictActionsRequest = { ...about, actions: [...script.wanted] };
-    return script.wanted.length > 0 ? { path: "/predict_actions", body } : null;
-  }
-  const steps = input("num-steps");
-  const returned: PredictRequest["return"] = ["futures", "modes"];
-  if (about.num_samples >= MIN_QUANTILE_SAMPLES) returned.push("quantiles");
-  const body: PredictRequest = { ...about, return: returned, num_modes: Number(input("num-modes").value) };
-  if (!steps.disabled && steps.value !== steps.max) body.num_steps = Number(steps.value);
-  return { path: "/predict", body };
-}
-
 /** Ask, and show what comes; in steps, each step as it comes. */
 async function answered(inSteps: boolean): Promise<void> {
+  if (webcam) return webcam.ask(options(models.current));
   const asked = question();
   if (!asked || !motion) return;
-  const { axes } = motion;
+  const [about, at] = [motion, now];
+  const { axes } = about;
   try {
     const found =
       asked.path === "/predict_actions"
@@ -157,19 +168,21 @@ async function answered(inSteps: boolean): Promise<void> {
         : inSteps
           ? await api.predictInSteps(asked.body, axes, showPreview)
           : await api.predict(asked.body, axes);
-    show(found);
-    hideNotice();
+    if (about !== motion) return; // it is about a motion that is gone
+    show(found, at);
+    notice.hide();
   } catch (error) {
     fail(error);
   }
 }
 
-function show(found: api.Answer): void {
+/** Show futures from frame `at` of the motion. */
+function show(found: api.Answer, at: number): void {
   if (!motion) return;
   answer = found;
   element("preview").hidden = true;
   modes.set(found);
-  view.setAnswer(found);
+  view.setAnswer(found, at);
   timeline.set({ fps: motion.fps, frames: motion.track.frames }, now, found);
   const { timing, steps, roundTripMs, warnings } = found;
   const inside = Object.values(timing).reduce((sum, ms) => sum + ms, 0);
@@ -186,7 +199,7 @@ function show(found: api.Answer): void {
 /** The futures as they stand after a step, for long enough to be seen. */
 async function showPreview({ futures, steps }: api.Preview): Promise<void> {
   if (!answer || answer.segments.length > 0) return;
-  view.setAnswer({ ...answer, futures, modes: answer.modes.filter(({ sample }) => sample < futures.length) });
+  view.setAnswer({ ...answer, futures, modes: answer.modes.filter(({ sample }) => sample < futures.length) }, now);
   const told = element("preview");
   told.hidden = false;
   told.textContent = `denoising: step ${steps.run} of ${steps.of}`;
@@ -196,15 +209,10 @@ async function showPreview({ futures, steps }: api.Preview): Promise<void> {
 }
 
 function showLook(): void {
-  view.setLook({
-    crowd: input("show-crowd").checked,
-    trails: input("show-trails").checked,
-    regions: input("show-regions").checked,
-    truth: input("show-truth").checked,
-    solo,
-  });
+  view.setLook({ ...look(), solo });
   const sample = solo && "sample" in solo ? solo.sample : (answer?.modes[solo?.mode ?? 0]?.sample ?? 0);
   timeline.setSample(sample);
+  script.tell(answer?.segments[sample] ?? [], answer?.fps ?? 1);
   element("legend-truth").hidden = !input("show-truth").checked;
   element("regions-text").textContent = regionsText();
   redraw();
@@ -217,13 +225,6 @@ function regionsText(): string {
   return answer.regions.calibrated
     ? "Of root, head and wrists; as wide as was measured on people that the model had not seen."
     : "Of root, head and wrists; as wide as the samples say, not measured on people.";
-}
-
-function showSliders(): void {
-  for (const slider of document.querySelectorAll<HTMLInputElement>(".slider input")) {
-    const told = slider.parentElement?.querySelector("output");
-    if (told) told.textContent = slider.value;
-  }
 }
 
 function redraw(): void {
@@ -245,7 +246,7 @@ function seek(seconds: number): void {
 }
 
 function setNow(frame: number): void {
-  if (!motion) return;
+  if (!motion || webcam) return;
   const ahead = timeline.player.time - timeline.nowSeconds;
   now = timeline.bounded(frame);
   timeline.set({ fps: motion.fps, frames: motion.track.frames }, now, answer);
@@ -271,18 +272,17 @@ function fail(error: unknown): void {
   if (error instanceof api.AwayError) server.lost();
   else {
     const wantsKey = error instanceof api.ProblemError && error.problem.status === 401;
-    element("notice-text").textContent = error instanceof Error ? error.message : String(error);
-    element("key-form").hidden = !wantsKey;
-    element("notice").hidden = false;
+    notice.show(error instanceof Error ? error.message : String(error), { wantsKey });
   }
 }
 
-function hideNotice(): void {
-  element("notice").hidden = true;
-}
-
-function copy(text: string): void {
-  const told = element("take-text");
+function copy(written: (question: Question) => string): void {
+  const [asked, told] = [question(), element("take-text")];
+  if (!asked) {
+    told.textContent = "Nothing is asked yet.";
+    return;
+  }
+  const text = written(asked);
   navigator.clipboard.writeText(text).then(
     () => (told.textContent = `Copied ${text.length} characters.`),
     () => (told.textContent = "The browser did not let the page copy."),
@@ -313,19 +313,18 @@ const TURNS: Record<string, [azimuth: number, closer: number]> = {
   ArrowLeft: [0.12, 1], ArrowRight: [-0.12, 1], "+": [0, 0.9], "-": [0, 1.1],
 };
 
+function act(key: string, target: HTMLElement): boolean {
+  const turn = target.id === "canvas" ? TURNS[key] : undefined;
+  if (turn) stage.orbit(...turn);
+  else if (key in KEYS) KEYS[key]();
+  else if (/^[1-8]$/.test(key)) modes.toggle(Number(key) - 1);
+  else return false;
+  return true;
+}
+
 function listen(): void {
-  document.addEventListener("keydown", (event) => {
-    const target = event.target as HTMLElement;
-    const typing = target.closest("dialog[open], select, input:not([type=range], [type=checkbox], [type=radio])");
-    const pressing = event.key === " " && target.closest("button, input[type=checkbox], input[type=radio], a");
-    if (typing || pressing || event.ctrlKey || event.metaKey || event.altKey) return;
-    const turn = target.id === "canvas" ? TURNS[event.key] : undefined;
-    const act = turn ? () => stage.orbit(...turn) : KEYS[event.key];
-    if (act) act();
-    else if (/^[1-8]$/.test(event.key)) modes.toggle(Number(event.key) - 1);
-    else return;
-    event.preventDefault();
-  });
+  listenForKeys(act);
+  listenForFiles((files) => void load(() => fromFiles(files)));
   button("play").addEventListener("click", play);
   for (const radio of document.querySelectorAll("input[name=ask]")) {
     radio.addEventListener("change", () => {
@@ -335,7 +334,6 @@ function listen(): void {
   }
   for (const slider of document.querySelectorAll(".slider input")) {
     slider.addEventListener("input", () => {
-      numSamples[performing() ? "perform" : "predict"] = Number(input("num-samples").value);
       showSliders();
       void ask();
     });
@@ -348,53 +346,18 @@ function listen(): void {
     seek(Math.max(timeline.player.time, timeline.nowSeconds + 1));
     void answered(true);
   });
-  button("copy-curl").addEventListener("click", () => copy(asCurl(question() ?? unasked())));
-  button("copy-python").addEventListener("click", () => copy(asPython(question() ?? unasked())));
+  button("copy-curl").addEventListener("click", () => copy(asCurl));
+  button("copy-python").addEventListener("click", () => copy(asPython));
   button("save-bvh").addEventListener("click", () => void download("model/bvh", "bvh"));
   button("save-json").addEventListener("click", () => void download("application/json", "json"));
-  button("notice-close").addEventListener("click", hideNotice);
-  element("key-form").addEventListener("submit", (event) => {
-    event.preventDefault();
-    api.useKey(input("key").value);
-    hideNotice();
-    void begin();
-  });
+  button("webcam").addEventListener("click", () => void watch());
   onPaletteChange(() => view.paint(readPalette()));
-  listenForFiles();
-}
-
-function unasked(): Question {
-  throw new Error("nothing is asked yet");
-}
-
-function listenForFiles(): void {
   for (const [name, label] of Object.entries(DEMOS)) {
     const chip = made("button", label, { type: "button", className: "chip" });
     chip.dataset.demo = name;
     chip.addEventListener("click", () => void load(() => demo(name)));
     element("demos").append(chip);
   }
-  const open = (files: FileList | null | undefined) => {
-    const some = [...(files ?? [])];
-    if (some.length > 0) void load(() => fromFiles(some));
-  };
-  const chooser = input("file");
-  button("open").addEventListener("click", () => chooser.click());
-  chooser.addEventListener("change", () => {
-    open(chooser.files);
-    chooser.value = "";
-  });
-  const over = (on: boolean) => document.body.classList.toggle("dropping", on);
-  document.addEventListener("dragover", (event) => {
-    event.preventDefault();
-    over(true);
-  });
-  document.addEventListener("dragleave", ({ relatedTarget }) => relatedTarget ?? over(false));
-  document.addEventListener("drop", (event) => {
-    event.preventDefault();
-    over(false);
-    open(event.dataTransfer?.files);
-  });
 }
 
 listen();

@@ -1,6 +1,6 @@
 /** A script of actions: buttons add to it, and each of its entries can be taken out again. */
 
-import type { Action } from "../client";
+import type { Action, ActionSegment } from "../client";
 import { button, colour, element, made } from "./dom";
 
 export class Script {
@@ -39,6 +39,16 @@ export class Script {
     this.set(this.labels.filter((label) => known.has(label)));
   }
 
+  /** Tell how long each action takes in the future that is shown. */
+  tell(segments: ActionSegment[], fps: number): void {
+    for (const [index, entry] of [...element("script").children].entries()) {
+      const segment = segments[index];
+      const seconds = segment?.action === this.labels[index] ? (segment.end - segment.start) / fps : null;
+      const told = entry.querySelector("small");
+      if (told) told.textContent = seconds === null ? "" : `${seconds.toFixed(1)} s`;
+    }
+  }
+
   private set(labels: string[]): void {
     this.labels = labels.slice(0, this.most);
     element("script").replaceChildren(
@@ -48,7 +58,7 @@ export class Script {
         const out = made("button", "×", { type: "button" });
         out.setAttribute("aria-label", `Take out ${label}, number ${index + 1}`);
         out.addEventListener("click", () => this.set(this.labels.filter((_, i) => i !== index)));
-        entry.append(out);
+        entry.append(made("small"), out);
         return entry;
       }),
     );

@@ -28,6 +28,7 @@ export class View {
   private motion: Motion | null = null;
   private now = 0;
   private answer: Answer | null = null;
+  private answered = 0; // the last frame that the answer is about
   private look: Look = { crowd: true, trails: true, regions: false, truth: false, solo: null };
   private palette: Palette | null = null;
   private ground = 0;
@@ -35,6 +36,7 @@ export class View {
   private joints: number[] = [];
   private pose = new Float32Array(0);
   private nowPose = new Float32Array(0);
+  private startPose = new Float32Array(0);
   private readonly bodyMaterial = new MeshStandardMaterial({ roughness: 0.62, metalness: 0.05 });
   private readonly crowdMaterial = new MeshLambertMaterial({ transparent: true, depthWrite: false });
   private readonly chosenMaterial = new MeshStandardMaterial({
@@ -79,6 +81,7 @@ export class View {
     this.joints = watched(motion.skeleton).slice(0, MAX_WATCHED);
     this.pose = new Float32Array(motion.track.joints * 3);
     this.nowPose = new Float32Array(motion.track.joints * 3);
+    this.startPose = new Float32Array(motion.track.joints * 3);
     for (const figures of [this.body, this.crowd, this.chosen, this.truth]) {
       figures.setSkeleton(motion.skeleton);
     }
@@ -86,7 +89,7 @@ export class View {
     this.stage.lookAt(this.rootOf(this.nowPose), this.ground, this.heading());
   }
 
-  /** The last frame observed; what it led to so far is no longer shown. */
+  /** The last frame observed; until there is an answer about it, the one before is shown. */
   setNow(now: number): void {
     if (!this.motion) return;
     this.now = now;
@@ -97,11 +100,16 @@ export class View {
   /** The newest frames of a motion that goes on. */
   replaceMotion(motion: Motion, now: number): void {
     this.motion = motion;
+    this.answered = now;
     this.setNow(now);
   }
 
-  setAnswer(answer: Answer | null): void {
+  /** Futures that begin after frame `at`. */
+  setAnswer(answer: Answer, at: number): void {
+    if (!this.motion) return;
     this.answer = answer;
+    this.answered = at;
+    poseAt(this.motion.track, at, this.startPose);
     this.drawTrails();
   }
 
@@ -120,7 +128,8 @@ export class View {
     this.body.end();
     const centre = this.rootOf(this.pose);
 
-    const ahead = answer && seconds > 0 ? seconds * answer.fps - 1 : null;
+    const since = seconds + (this.now - this.answered) / motion.fps;
+    const ahead = answer && seconds > 0 ? since * answer.fps - 1 : null;
     this.drawFutures(ahead, centre);
     this.drawTruth(seconds);
     if (ahead !== null && answer?.regions && this.look.regions) {
@@ -170,7 +179,7 @@ export class View {
       track: (answer as Answer).futures[sample],
       from: 0,
       to: (answer as Answer).futures[sample].frames,
-      start: this.nowPose,
+      start: this.startPose,
       color: (frame) => this.colourOf(sample, frame),
     });
     const on = look.trails;
@@ -207,9 +216,9 @@ export class View {
   private futurePose(track: Track, frame: number): void {
     poseAt(track, frame, this.pose);
     if (frame >= 0) return;
-    const share = Math.max(-frame, 0); // before the first frame: from the last one observed
+    const share = Math.min(-frame, 1); // before the first frame: from the last one observed
     for (let i = 0; i < this.pose.length; i++) {
-      this.pose[i] = this.pose[i] * (1 - share) + this.nowPose[i] * share;
+      this.pose[i] = this.pose[i] * (1 - share) + this.startPose[i] * share;
     }
   }
 
