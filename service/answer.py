@@ -9,14 +9,17 @@ import numpy as np
 from jaxtyping import Float
 
 from models.bundle import Manifest
-from service.axes import UNITS_PER_METRE
+from models.motion.axes import UNITS_PER_METRE
+from service.downloads import download
 from service.engine.trajectory import Preview, Result, Segment
 from service.futures import DECIMALS, BoneLengths, caller_futures, caller_segments, written
-from service.media import encoded
+from service.media import MOTIONS, encoded
 from service.modes import modes
 from service.observation import Observation
 from service.quantiles import regions
 from service.worker import Timing
+
+_IN_FILES = ("futures", "quantiles")
 
 
 @dataclass(kw_only=True, slots=True, eq=False)
@@ -39,17 +42,29 @@ class Answer:
     levels: Sequence[float] = ()
     stages_s: dict[str, float] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
+    motions: Sequence[Float[np.ndarray, "_ J 3"]] = ()
+    about: dict[str, Any] = field(default_factory=dict)
 
     def final(self, result: Result, timing: Timing) -> bytes:
-        """The body of ``PredictResponse``, or of ``PredictActionsResponse`` for actions."""
+        """The body of ``PredictResponse``, or of ``PredictActionsResponse`` for actions.
+
+        It is empty where ``files`` are to be written.
+        """
         started_s = perf_counter()
-        part = self._continued(result) if self.manifest.actions is None else self._performed(result)
         caller = self.observation.caller
+        in_world = self._in_world(result.futures, result.segments)
+        segments = caller_segments(result.segments, manifest=self.manifest, fps=caller.fps)
+        performs = self.manifest.actions is not None
+        part = (
+            self._performed(in_world, segments) if performs else self._continued(in_world, result)
+        )
         names = dict(zip(caller.order, caller.skeleton.joints, strict=True))
+        sources = dict(zip(caller.order, caller.sources, strict=True))
         content = self.head() | {
             "fps": caller.fps,
             "skeleton": caller.skeleton.name,
             "joints": [names[i] for i in range(len(names))],
+            "joint_sources": [sources[i] for i in range(len(names))],
             **part,
             "warnings": [*self.observation.warnings, *self.warnings],
         }
@@ -58,7 +73,14 @@ class Answer:
             "engine": timing.engine_s,
             "answer": perf_counter() - started_s,
         }
-        body = encoded(content | {"timing_ms": self.milliseconds()}, self.media_type)
+        content["timing_ms"] = self.milliseconds()
+        if self.media_type in MOTIONS:
+            ends = [parts[-1].end for parts in segments] or [in_world.shape[1]] * len(in_world)
+            self.motions = [path[:end] for path, end in zip(in_world, ends, strict=True)]
+            self.about = {key: told for key, told in content.items() if key not in _IN_FILES}
+            body = b""
+        else:
+            body = encoded(content, self.media_type)
         self.stages_s["answer"] = perf_counter() - started_s
         self.facts |= {
             "steps_run": result.steps_run,
@@ -66,6 +88,11 @@ class Answer:
             "stopped_by": result.stopped_by,
         }
         return body
+
+    def files(self) -> tuple[bytes, dict[str, str]]:
+        """The futures of a final answer as files, and their headers; it takes a while."""
+        caller = self.observation.caller
+        return download(self.motions, caller, self.media_type, about=self.about)
 
     def milliseconds(self) -> dict[str, float]:
         """How long each stage took; that of the answer, so far."""
@@ -100,8 +127,7 @@ class Answer:
             segments=segments,
         )
 
-    def _continued(self, result: Result) -> dict[str, Any]:
-        in_world = self._in_world(result.futures)
+    def _continued(self, in_world: Float[np.ndarray, "N H J 3"], result: Result) -> dict[str, Any]:
         content: dict[str, Any] = {"num_frames": in_world.shape[1]}
         if "futures" in self.returned:
             futures = written(in_world, self.observation.caller)
@@ -137,12 +163,12 @@ class Answer:
             "calibrated": found.calibrated,
         }
 
-    def _performed(self, result: Result) -> dict[str, Any]:
+    def _performed(
+        self, in_world: Float[np.ndarray, "N H J 3"], segments: Sequence[Sequence[Segment]]
+    ) -> dict[str, Any]:
         """Each future as long as its actions took, and the frames of each action in it."""
-        caller = self.observation.caller
         labels = self.manifest.actions.labels if self.manifest.actions else ()
-        futures = written(self._in_world(result.futures, result.segments), caller)
-        segments = caller_segments(result.segments, manifest=self.manifest, fps=caller.fps)
+        futures = written(in_world, self.observation.caller)
         return {
             "futures": [
                 {

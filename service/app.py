@@ -10,7 +10,7 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from service import files, predictions
+from service import files, predictions, validation
 from service.catalog import Catalog
 from service.guard import Guard
 from service.metrics import Metrics
@@ -73,6 +73,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.streams = set()
     app.include_router(predictions.router)
     app.include_router(files.router)
+    app.include_router(validation.router)
     app.include_router(router)
     app.include_router(health)
     add_page(app, pose_landmarker=settings.pose_landmarker)

@@ -1,4 +1,4 @@
-"""The command line ``posefutures``: serve, predict, models, actions."""
+"""The command line ``posefutures``: serve, predict, convert, models, actions."""
 
 import asyncio
 import socket
@@ -15,9 +15,9 @@ from jaxtyping import Float, Shaped
 from pydantic import ValidationError
 
 from models.bundle import BundleError
-from models.motion.formats.bvh import write_bvh
 from models.motion.formats.errors import FormatError
-from models.motion.formats.files import read_motion
+from models.motion.formats.files import SUFFIXES, WRITTEN_SUFFIXES, read_motion, write_motion
+from models.motion.gaps import without_gaps
 from models.motion.kinematics import inverse_kinematics
 from models.motion.motion import Motion
 from service import server
@@ -29,7 +29,9 @@ from service.exchange import ClientError
 from service.messages import ActionsOptions, ActionsPrediction, Prediction, PredictOptions, Preview
 from service.schemas import MAX_SEED, MAX_STOP_THRESHOLD_M
 from service.settings import Settings
+from service.skeletons import standard_skeleton
 
+_READ = f"a motion: {', '.join(SUFFIXES)} (.amc beside its .asf), or a folder of OpenPose's frames"
 SENT_S = 10.0  # of a motion, up to now: more than any bundle looks at
 
 app = typer.Typer(
@@ -44,6 +46,8 @@ class OutputFormat(StrEnum):
     """What ``predict`` writes."""
 
     BVH = "bvh"
+    GLB = "glb"
+    JSON = "json"
     NPZ = "npz"
 
 
@@ -85,7 +89,7 @@ def actions() -> None:
 
 @app.command()
 def predict(
-    file: Annotated[Path, typer.Argument(help="a motion: .bvh, .amc beside its .asf, or .npz")],
+    file: Annotated[Path, typer.Argument(help=_READ)],
     num_samples: Annotated[int, typer.Option(min=1, help="how many futures")] = 10,
     num_steps: Annotated[int | None, typer.Option(min=1, help="stop early")] = None,
     deadline_ms: Annotated[
@@ -148,14 +152,37 @@ def predict(
         out.mkdir(parents=True, exist_ok=True)
         for warning in answer.warnings:
             typer.echo(f"warning: {warning}", err=True)
-        if output_format is OutputFormat.BVH:
-            _write_bvh(out, motion, list(answer.futures))
-        else:
+        if output_format is OutputFormat.NPZ:
             _write_npz(out, motion, answer)
+        else:
+            _write_files(out, motion, list(answer.futures), output_format)
         if isinstance(answer, Prediction):
             _tell(answer)
         typer.echo(
             f"{num_samples} futures of {file.name} by {answer.model}, seed {answer.seed}, in {out}"
+        )
+
+
+@app.command()
+def convert(
+    file: Annotated[Path, typer.Argument(help=_READ)],
+    out: Annotated[Path, typer.Argument(help=f"a file: {', '.join(WRITTEN_SUFFIXES)}")],
+    skeleton: Annotated[
+        str | None, typer.Option(help="a standard skeleton to put it on; its own by default")
+    ] = None,
+    fps: Annotated[float | None, typer.Option(min=1, max=1000, help="frames per second")] = None,
+) -> None:
+    """Write the motion in a file as a file of another kind."""
+    with _one_line_errors():
+        motion = read_motion(file)
+        if skeleton is not None:
+            motion = without_gaps(motion).to(standard_skeleton(skeleton))
+        if fps is not None:
+            motion = without_gaps(motion).resample(fps)
+        write_motion(out, motion)
+        typer.echo(
+            f"{motion.num_frames} frames of {motion.skeleton.num_joints} joints at "
+            f"{motion.fps:g} frames a second, in {out}"
         )
 
 
@@ -259,7 +286,12 @@ def _until(motion: Motion, at: float | None) -> Motion:
     return motion[max(0, end - round(SENT_S * motion.fps)) : end]
 
 
-def _write_bvh(out: Path, motion: Motion, futures: Sequence[Float[np.ndarray, "_ J 3"]]) -> None:
+def _write_files(
+    out: Path,
+    motion: Motion,
+    futures: Sequence[Float[np.ndarray, "_ J 3"]],
+    output_format: OutputFormat,
+) -> None:
     width = len(str(len(futures) - 1))
     for i, future in enumerate(futures):
         rotations = None
@@ -276,7 +308,7 @@ def _write_bvh(out: Path, motion: Motion, futures: Sequence[Float[np.ndarray, "_
             rotations=rotations,
             rest_offsets=motion.rest_offsets,
         )
-        write_bvh(out / f"{name}.bvh", sample)
+        write_motion(out / f"{name}.{output_format}", sample)
 
 
 def _write_npz(out: Path, motion: Motion, answer: Prediction | ActionsPrediction) -> None:

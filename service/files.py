@@ -8,10 +8,10 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
-from jaxtyping import Float, Shaped
 
 from models.motion.formats.errors import FormatError, MalformedFileError, UnsupportedFileError
 from models.motion.formats.files import SUFFIXES, read_motion
+from models.motion.formats.pose_json import request_fields, with_nulls
 from models.motion.motion import Motion
 from service import schemas
 from service.body import BodyRoute, read_body
@@ -25,7 +25,6 @@ from service.errors import (
     RateLimitedError,
     UnauthorisedError,
 )
-from service.futures import DECIMALS
 from service.media import DOCUMENTS, JSON, accepted, encoded
 from service.problems import declared
 
@@ -130,6 +129,8 @@ def _unpacked(path: Path) -> Path:
     except (BadZipFile, RuntimeError, NotImplementedError) as error:
         raise MalformedFileError(path.name, found=str(error), right="must be a zip") from error
     motions = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    if len(motions) > 1 and all(p.suffix.lower() == ".json" for p in motions):
+        return folder  # frames, a file for each
     if len(motions) != 1:
         raise UnsupportedFileError(
             path.name,
@@ -141,23 +142,14 @@ def _unpacked(path: Path) -> Path:
 
 def _fields(motion: Motion, start_s: float, end_s: float | None, media_type: str) -> dict[str, Any]:
     cut = _cut(motion, start_s, end_s)
-    shown = cut.resample(MAX_FPS) if cut.fps > MAX_FPS else cut
-    skeleton = motion.skeleton
-    decimals = np.round(shown.positions, DECIMALS).astype(np.float32)
-    return {
-        "name": motion.name,
-        "poses": _with_nulls(decimals) if media_type == JSON else np.ascontiguousarray(decimals),
-        "skeleton": {
-            "joints": list(skeleton.joints),
-            "parents": list(skeleton.parents),
-            "map": dict(skeleton.mapping) or None,
-        },
-        "axes": {"up": "z", "units": "m"},
-        "fps": shown.fps,
-        "parents": list(skeleton.parents),
+    fields = request_fields(cut.resample(MAX_FPS) if cut.fps > MAX_FPS else cut)
+    poses = fields["poses"].astype(np.float32)
+    holes = bool(np.isnan(poses).any())
+    return fields | {
+        "poses": with_nulls(fields["poses"]) if holes and media_type == JSON else poses,
+        "parents": fields["skeleton"]["parents"],
         "start_s": start_s,
         "duration_s": motion.duration,
-        "warnings": [],
     }
 
 
@@ -172,14 +164,3 @@ def _cut(motion: Motion, start_s: float, end_s: float | None) -> Motion:
             "end_s",
         )
     return motion[first:last]
-
-
-def _with_nulls(poses: Float[np.ndarray, "T J 3"]) -> Shaped[np.ndarray, "..."] | list[Any]:
-    """Poses for JSON, which has no NaN: a joint not seen is null."""
-    missing = np.argwhere(np.isnan(poses[..., 0]))
-    if not len(missing):
-        return np.ascontiguousarray(poses)
-    frames: list[list[Any]] = poses.tolist()
-    for frame, joint in missing:
-        frames[frame][joint] = None
-    return frames

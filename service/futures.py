@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from models.bundle import Manifest
+from models.motion.axes import UNITS_PER_METRE
 from models.motion.kinematics import fit_bone_lengths, rotate_yaw, yaw
 from models.motion.motion import Motion
 from models.motion.skeleton import Skeleton, joint_map
-from service.axes import UNITS_PER_METRE
 from service.engine.trajectory import Segment
 from service.observation import Caller, Observation
 

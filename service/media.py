@@ -1,4 +1,4 @@
-"""The media types that go over HTTP, in and out: JSON, MessagePack, NumPy's npz and two streams.
+"""The media types that go over HTTP, in and out: JSON, MessagePack, npz, two streams and motions.
 
 An array is nested lists in JSON; in MessagePack the map {"shape": [...], "dtype": "float32",
 "data": its little-endian bytes}; in an npz an array of its own, named by its path, such as
@@ -25,8 +25,12 @@ MSGPACK = "application/msgpack"
 NPZ = "application/x-npz"
 EVENT_STREAM = "text/event-stream"
 NDJSON = "application/x-ndjson"
+BVH = "model/bvh"
+GLB = "model/gltf-binary"
+ZIP = "application/zip"
 
 DOCUMENTS = (JSON, MSGPACK, NPZ)
+MOTIONS = (BVH, GLB)
 STREAMS = (EVENT_STREAM, NDJSON)
 
 _Arrays: TypeAlias = dict[str, Shaped[np.ndarray, "..."]]

@@ -26,6 +26,8 @@ class Options(TypedDict, total=False):
     skeleton: str | Mapping[str, Any] | None
     axes: Mapping[str, str]
     fps: float | None
+    timestamps: Sequence[float] | None
+    confidence: Float[np.ndarray, "T J"] | None
     num_samples: int
     seed: int | None
     model: str | None
@@ -72,10 +74,14 @@ class Preview:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Answer:
-    """What every answer says beside its futures; ``timing_ms`` of each stage is the server's."""
+    """What every answer says beside its futures; ``timing_ms`` of each stage is the server's.
+
+    ``joint_sources`` says of each joint whether it was observed, derived or imputed.
+    """
 
     id: str
     joints: tuple[str, ...]
+    joint_sources: tuple[str, ...]
     fps: float
     seed: int
     model: str
@@ -210,6 +216,7 @@ def _said(content: dict[str, Any]) -> dict[str, Any]:
     return {
         "id": content["id"],
         "joints": tuple(content["joints"]),
+        "joint_sources": tuple(content["joint_sources"]),
         "fps": content["fps"],
         "seed": content["seed"],
         "model": content["model"]["name"],

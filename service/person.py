@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from service.axes import UNITS_PER_METRE, Units
+from models.motion.axes import UNITS_PER_METRE, Units
 from service.errors import PosesError
 
 MAX_COORDINATE_M = 1e7  # the largest that maps use

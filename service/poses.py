@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from service.errors import PosesError
+from service.errors import FieldError, PosesError
 
 _NUMBERS = {float, int}
 
@@ -34,6 +34,51 @@ def poses_array(
     array = np.full((len(joints), 3), np.nan)
     array[present] = _finite(list(chain.from_iterable(seen)), np.flatnonzero(present), num_joints)
     return array.reshape(len(poses), num_joints, 3)
+
+
+def times_array(times: Sequence[Any], *, num_frames: int) -> Float[np.ndarray, "T"]:
+    """Seconds of each frame.
+
+    Raises:
+        FieldError: there is not one for each frame, or they do not rise.
+    """
+    if len(times) != num_frames:
+        raise FieldError(
+            pointer="/timestamps",
+            found=f"{len(times)} times",
+            expected=f"there must be one for each of {num_frames} frames",
+        )
+    for i, time in enumerate(times):
+        if not _is_finite(time) or (i and time <= times[i - 1]):
+            raise FieldError(
+                pointer=f"/timestamps/{i}",
+                found=shown(time),
+                expected="times are seconds, finite numbers of which each is later than the last",
+            )
+    return np.array(times, dtype=np.float64)
+
+
+def confidence_array(
+    confidence: Sequence[Any] | Shaped[np.ndarray, "..."], *, num_frames: int, num_joints: int
+) -> Float[np.ndarray, "T J"]:
+    """What each joint of each frame is worth.
+
+    Raises:
+        FieldError: there is not one number from 0 to 1 for each joint of each frame.
+    """
+    expected = f"there must be {num_joints} numbers from 0 to 1 for each of {num_frames} frames"
+    rows = confidence.tolist() if isinstance(confidence, np.ndarray) else list(confidence)
+    if len(rows) != num_frames:
+        raise FieldError(pointer="/confidence", found=f"{len(rows)} frames", expected=expected)
+    for i, row in enumerate(rows):
+        if not isinstance(row, list) or len(row) != num_joints:
+            raise FieldError(pointer=f"/confidence/{i}", found=shown(row), expected=expected)
+        for j, value in enumerate(row):
+            if not _is_finite(value) or not 0.0 <= value <= 1.0:
+                raise FieldError(
+                    pointer=f"/confidence/{i}/{j}", found=shown(value), expected=expected
+                )
+    return np.array(rows, dtype=np.float64).reshape(num_frames, num_joints)
 
 
 def _checked(poses: Shaped[np.ndarray, "..."], num_joints: int) -> Float[np.ndarray, "T J 3"]:

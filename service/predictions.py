@@ -11,11 +11,9 @@ import orjson
 from fastapi import APIRouter, Header, Request, Response
 
 from models.bundle import Manifest
-from models.motion.skeleton import Skeleton
 from service import schemas
 from service.actions import action_indices, max_frames
 from service.answer import Answer
-from service.axes import Axes
 from service.body import BodyRoute
 from service.delivery import Stream, event, unless_gone
 from service.dependencies import TheCatalog, TheSettings, metrics_of, settings_of, visit_of
@@ -37,12 +35,12 @@ from service.errors import (
     UnknownRequestError,
 )
 from service.futures import num_frames
-from service.media import DOCUMENTS, MSGPACK, NPZ, STREAMS, accepted
+from service.media import BVH, DOCUMENTS, GLB, MOTIONS, MSGPACK, NPZ, STREAMS, ZIP, accepted
 from service.observation import Observation, read_observation
 from service.problems import declared
 from service.quantiles import check_levels
 from service.settings import Settings
-from service.skeletons import OwnJoints, standard_skeleton
+from service.skeletons import requested_skeleton
 from service.telemetry import record_stages
 from service.visits import CLIENT_GONE
 from service.worker import Timing, Worker
@@ -90,15 +88,20 @@ _BINARY = {
         "as JSON"
     ),
 }
+_FILES = {
+    BVH: _described("the future as a BVH file, Y-up, centimetres, where num_samples is 1"),
+    GLB: _described("the future as an animated glTF file where num_samples is 1"),
+    ZIP: _described("where a file was accepted and num_samples is more: one for each future"),
+}
 _EVENTS = _described(
     "accepted {id, model, seed, steps.of}, preview {id, steps, futures} after each step, final "
     "(the plain JSON), end; or an error instead of what is left; a stream without end is not "
     "complete"
 )
 _BODIES = {"requestBody": {"content": _BINARY}}
-_ANSWERS: dict[int | str, dict[str, Any]] = {200: {"content": _BINARY}}
+_ANSWERS: dict[int | str, dict[str, Any]] = {200: {"content": _BINARY | _FILES}}
 _ANSWERS_OR_EVENTS: dict[int | str, dict[str, Any]] = {
-    200: {"content": _BINARY | dict.fromkeys(STREAMS, _EVENTS)}
+    200: {"content": _BINARY | _FILES | dict.fromkeys(STREAMS, _EVENTS)}
 }
 
 
@@ -124,11 +127,14 @@ async def predict(
     timeout_s: _TimeoutHeader = None,
 ) -> Response:
     """N futures of the person in the poses, in the caller's world, skeleton and frame rate."""
-    media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *STREAMS))
+    media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *STREAMS, *MOTIONS))
     manifest, worker = catalog.ready(body.model, with_actions=False)
     horizon = _horizon(body, settings, manifest)
     frames = horizon or manifest.horizon
-    _check_limits(body, settings, manifest, frames=frames)
+    _check_limits(body, settings)
+    _check_returned(body, media_type)
+    observation = await _observation(body, manifest)
+    _check_answer(body, settings, manifest, frames=frames, fps=observation.caller.fps)
     if "quantiles" in body.returned:
         check_levels(
             body.quantile_levels,
@@ -136,7 +142,7 @@ async def predict(
             calibration=manifest.calibration,
         )
     request = trajectory.Request(
-        observation=(observation := await _observation(body, manifest)).positions,
+        observation=observation.positions,
         num_samples=body.num_samples,
         num_steps=body.num_steps,
         seed=_seed(body),
@@ -183,13 +189,16 @@ async def predict_actions(
     timeout_s: _TimeoutHeader = None,
 ) -> Response:
     """N futures of the person in the poses, who performs the actions one after the other."""
-    media_type = accepted(http.headers.get("accept", ""), DOCUMENTS)
+    media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *MOTIONS))
     manifest, worker = catalog.ready(body.model, with_actions=True)
     indices = action_indices(body.actions, manifest)
     longest = max_frames(body.max_seconds_per_action, manifest)
-    _check_limits(body, settings, manifest, frames=len(indices) * (longest or manifest.horizon))
+    _check_limits(body, settings)
+    observation = await _observation(body, manifest)
+    most = len(indices) * (longest or manifest.horizon)
+    _check_answer(body, settings, manifest, frames=most, fps=observation.caller.fps)
     request = trajectory.Request(
-        observation=(observation := await _observation(body, manifest)).positions,
+        observation=observation.positions,
         num_samples=body.num_samples,
         seed=_seed(body),
         actions=indices,
@@ -241,10 +250,12 @@ async def _observation(body: schemas.ObservedMotion, manifest: Manifest) -> Obse
     def read() -> Observation:
         return read_observation(
             body.poses,
-            skeleton=_skeleton(body, manifest),
-            axes=Axes(up=body.axes.up, units=body.axes.units),
-            fps=body.fps or manifest.fps,
+            skeleton=requested_skeleton(body.caller_skeleton(), manifest),
+            axes=body.axes.axes(),
+            fps=body.fps,
             manifest=manifest,
+            times=body.timestamps,
+            confidence=body.confidence,
         )
 
     return await asyncio.to_thread(read) if len(body.poses) > MANY_FRAMES else read()
@@ -310,8 +321,11 @@ async def _answered(
     work = worker.predict(request, answer.final, request_key=answer.id)
     content = await unless_gone(http, work)
     ended()
+    headers = {"Content-Type": answer.media_type}
+    if answer.media_type in MOTIONS:
+        content, headers = await asyncio.to_thread(answer.files)
     timing = ", ".join(f"{name};dur={ms}" for name, ms in answer.milliseconds().items())
-    return Response(content, media_type=answer.media_type, headers={"Server-Timing": timing})
+    return Response(content, headers=headers | {"Server-Timing": timing})
 
 
 async def _streamed(
@@ -359,18 +373,7 @@ async def _streamed(
     )
 
 
-def _skeleton(body: schemas.ObservedMotion, manifest: Manifest) -> Skeleton | OwnJoints:
-    if isinstance(body.skeleton, schemas.SkeletonBody):
-        return body.skeleton.own_joints()
-    if body.skeleton is None or body.skeleton == manifest.skeleton.name:
-        return manifest.skeleton.skeleton()
-    return standard_skeleton(body.skeleton)
-
-
-def _check_limits(
-    body: schemas.ObservedMotion, settings: Settings, manifest: Manifest, *, frames: int
-) -> None:
-    """The engine holds ``frames`` a future, at the bundle's rate; the answer, at the caller's."""
+def _check_limits(body: schemas.ObservedMotion, settings: Settings) -> None:
     if body.num_samples > settings.max_samples:
         raise FieldError(
             pointer="/num_samples",
@@ -383,7 +386,27 @@ def _check_limits(
             found=f"{len(body.poses)} frames",
             expected=f"this server takes at most {settings.max_frames}; send the last ones",
         )
-    longest = max(frames, num_frames(frames, manifest=manifest, fps=body.fps or manifest.fps))
+
+
+def _check_returned(body: schemas.PredictRequest, media_type: str) -> None:
+    if media_type in MOTIONS and "futures" not in body.returned:
+        raise FieldError(
+            pointer="/return",
+            found=", ".join(body.returned),
+            expected=f"{media_type} holds futures, so they must be among what is returned",
+        )
+
+
+def _check_answer(
+    body: schemas.ObservedMotion,
+    settings: Settings,
+    manifest: Manifest,
+    *,
+    frames: int,
+    fps: float,
+) -> None:
+    """The engine holds ``frames`` a future, at the bundle's rate; the answer, at the caller's."""
+    longest = max(frames, num_frames(frames, manifest=manifest, fps=fps))
     if body.num_samples * longest > settings.max_poses:
         raise FieldError(
             pointer="/num_samples",

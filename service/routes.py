@@ -1,12 +1,13 @@
 """The paths that tell of the service: what it can do, what it takes, and how it is."""
 
+from dataclasses import asdict
 from itertools import chain
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from models.motion.skeleton import SKELETONS
+from models.motion.standards import STANDARDS
 from service import schemas
 from service.body import BodyRoute
 from service.catalog import Entry
@@ -67,8 +68,13 @@ async def skeletons() -> schemas.Skeletons:
     """The skeletons that a request may name."""
     return schemas.Skeletons(
         skeletons=[
-            schemas.StandardSkeleton(name=s.name, joints=list(s.joints), parents=list(s.parents))
-            for s in SKELETONS.values()
+            schemas.StandardSkeleton(
+                name=name,
+                joints=list(standard.joints),
+                parents=list(standard.parents),
+                axes=schemas.AxesBody(**asdict(standard.axes)),
+            )
+            for name, standard in STANDARDS.items()
         ]
     )
 

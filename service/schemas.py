@@ -5,10 +5,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, InstanceOf, Tag, WithJsonSchema
 
-from service.axes import Units, Up
+from models.motion.axes import Axes, Handed, Units, Up
+from models.motion.gaps import MIN_CONFIDENCE
+from models.motion.standards import STANDARDS
+from service.checks import About
 from service.engine.trajectory import StoppedBy
 from service.example import ACTIONS_EXAMPLE, EXAMPLE
 from service.futures import BoneLengths
+from service.observation import MAX_FPS, MIN_FPS, Source
 from service.quantiles import DEFAULT_LEVELS
 from service.skeletons import OwnJoints
 
@@ -76,28 +80,78 @@ SkeletonField = Annotated[
 
 
 class AxesBody(_Body):
-    """The caller's coordinates, which are right-handed."""
+    """The caller's coordinates."""
 
     up: Up = Field(default="z", description="the axis that points up")
     units: Units = "m"
+    handed: Handed = Field(default="right", description="left as in Unity and Unreal")
+
+    def axes(self) -> Axes:
+        """The same as the service uses it."""
+        return Axes(up=self.up, units=self.units, handed=self.handed)
 
 
-class ObservedMotion(_Body):
-    """An observed motion, and what every request may say of it and of its futures."""
+def _usual_axes(fields: dict[str, Any]) -> AxesBody:
+    """Those in which a standard skeleton usually comes."""
+    name = fields.get("skeleton")
+    standard = STANDARDS.get(name) if isinstance(name, str) else None
+    axes = standard.axes if standard else Axes()
+    return AxesBody(up=axes.up, units=axes.units, handed=axes.handed)
+
+
+class ObservedPoses(_Body):
+    """Poses, and all that is to be known of them."""
 
     poses: Annotated[list[Any] | InstanceOf[np.ndarray], WithJsonSchema(_POSES_SCHEMA)]
     skeleton: SkeletonField | None = Field(
         default=None, description="a name of GET /skeletons, or own joints; the model's by default"
     )
-    axes: AxesBody = AxesBody()
-    fps: float | None = Field(
-        default=None, ge=5, le=300, description="frames per second; the model's by default"
+    axes: AxesBody = Field(
+        default_factory=_usual_axes,
+        description="those of GET /skeletons by default; of own joints, +Z up and metres",
     )
+    fps: float | None = Field(
+        default=None,
+        ge=MIN_FPS,
+        le=MAX_FPS,
+        description="frames per second; that of the timestamps or else the model's by default",
+    )
+    timestamps: Annotated[
+        list[Any] | None, WithJsonSchema({"type": "array", "items": {"type": "number"}})
+    ] = Field(
+        default=None,
+        description="seconds of each frame, from any time on; they may be uneven, and the answer "
+        "is at the rate fps all the same",
+    )
+    confidence: Annotated[
+        list[Any] | InstanceOf[np.ndarray] | None,
+        WithJsonSchema(
+            {
+                "type": "array",
+                "items": {"type": "array", "items": {"type": "number", "minimum": 0, "maximum": 1}},
+            }
+        ),
+    ] = Field(
+        default=None,
+        description=f"[frames][joints]; below {MIN_CONFIDENCE} a joint counts as not seen, and the "
+        "less it is trusted the more it is smoothed",
+    )
+    model: str | None = Field(default=None, description="a name of GET /models")
+
+    def caller_skeleton(self) -> str | OwnJoints | None:
+        """The skeleton as the service uses it: a name, own joints, or none that is said."""
+        if isinstance(self.skeleton, SkeletonBody):
+            return self.skeleton.own_joints()
+        return self.skeleton
+
+
+class ObservedMotion(ObservedPoses):
+    """An observed motion, and what every request may say of it and of its futures."""
+
     num_samples: int = Field(default=10, ge=1, description="how many futures")
     seed: int | None = Field(
         default=None, ge=0, le=MAX_SEED, description="same seed, same futures; drawn by default"
     )
-    model: str | None = Field(default=None, description="a name of GET /models")
     bone_lengths: BoneLengths = Field(
         default="observed",
         description="`observed` keeps the person's own; `free` is what the network said",
@@ -182,7 +236,48 @@ class FileObservation(_Body):
     parents: list[int] = Field(description="index of each joint's parent, -1 for the root")
     start_s: float = Field(description="of the first frame in the file")
     duration_s: float = Field(description="of the whole file")
-    warnings: list[str]
+
+
+class ValidationFinding(_Body):
+    """Something odd."""
+
+    about: About
+    sentence: str
+
+
+class Problem(BaseModel):
+    """What went wrong (RFC 9457)."""
+
+    type: str = Field(examples=["/problems/unknown-skeleton"])
+    title: str
+    status: int
+    detail: str = Field(description="where, what was found, what would be right")
+    pointer: str | None = Field(default=None, description="the field, as a JSON pointer")
+    found: str | None = None
+    expected: str | None = None
+    retry_after_s: float | None = Field(
+        default=None, description="when to ask again, where it helps"
+    )
+
+
+class Validation(_Body):
+    """How poses are understood, and what is odd about them."""
+
+    predicts: bool = Field(description="whether they can be predicted from as they are")
+    problem: Problem | None = Field(default=None, description="why not")
+    skeleton: str
+    joints: list[str]
+    joint_sources: list[Source] = Field(description="of each joint, as an answer tells them")
+    map: dict[str, str] = Field(description="{own joint: the joint of body21 that it is}")
+    estimated: dict[str, list[str]] = Field(
+        description="{joint of body21 that none is: the own joints that tell where it is}"
+    )
+    guessed: list[str] = Field(description="joints of body21 of which nothing is known")
+    axes: AxesBody = Field(description="as they were said, or are usual for the skeleton")
+    looks_like: AxesBody = Field(description="what the poses look like")
+    fps: float
+    findings: list[ValidationFinding]
+    warnings: list[str] = Field(description="what a prediction would say beside its futures")
 
 
 class ModelRef(_Body):
@@ -210,6 +305,10 @@ class Answer(_Body):
     fps: float
     skeleton: str
     joints: list[str]
+    joint_sources: list[Source] = Field(
+        description="of each joint: `observed` in half of the frames or more, `derived` from "
+        "other joints, or `imputed`: guessed, or carried over from other frames"
+    )
     warnings: list[str]
     timing_ms: dict[str, float]
 
@@ -341,7 +440,8 @@ class StandardSkeleton(_Body):
 
     name: str
     joints: list[str]
-    parents: list[int]
+    parents: list[int] = Field(description="index of each joint's parent, -1 for the root")
+    axes: AxesBody = Field(description="in which it is expected where a request says nothing")
 
 
 class Skeletons(_Body):
@@ -381,18 +481,3 @@ class Limits(_Body):
     max_queued_rows: int = Field(description="samples under way, for one model")
     max_streams: int = Field(description="open at a time")
     rate_limit: str | None = Field(description="predictions of each caller")
-
-
-class Problem(BaseModel):
-    """What went wrong (RFC 9457)."""
-
-    type: str = Field(examples=["/problems/unknown-skeleton"])
-    title: str
-    status: int
-    detail: str = Field(description="where, what was found, what would be right")
-    pointer: str | None = Field(default=None, description="the field, as a JSON pointer")
-    found: str | None = None
-    expected: str | None = None
-    retry_after_s: float | None = Field(
-        default=None, description="when to ask again, where it helps"
-    )

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from models.motion.axes import Axes
 from models.motion.kinematics import bone_lengths, fit_bone_lengths
 from models.motion.skeleton import Skeleton
-from service.axes import Axes
 from service.engine.engine import Engine
 from service.engine.trajectory import Request
 from service.futures import BoneLengths, caller_futures, written
-from service.observation import observe
+from service.observation import Seen, observe
 from training.data.store import Store
 from training.data.windows import Windows
 from training.retrieval import nearest_windows, retrieved_futures
@@ -48,9 +48,11 @@ class BundlePredictor:
         skeleton = manifest.skeleton.skeleton()
         seen = [
             observe(
-                observation,
-                skeleton=skeleton,
-                order=tuple(range(skeleton.num_joints)),
+                Seen(
+                    world=observation,
+                    skeleton=skeleton,
+                    order=tuple(range(skeleton.num_joints)),
+                ),
                 axes=Axes(),
                 fps=manifest.fps,
                 manifest=manifest,

@@ -9,9 +9,18 @@ Weights = Mapping[str, float]
 # Names are compared without case, separators and rig prefixes.
 _CENTER_ALIASES: dict[str, tuple[str, ...]] = {
     "hips": ("hips", "hip", "pelvis", "midhip", "spinebase"),
-    "spine": ("lowerback", "waist", "spinenavel", "spinemid", "spine", "spine01", "spine1"),
-    "chest": ("thorax", "chest", "spinechest", "spine02", "spine2", "spine1", "upperback"),
-    "neck": ("lowerneck", "necktwist01", "neck", "neck01", "neck1"),
+    "spine": ("lowerback", "waist", "spinenavel", "spine", "spine01", "spine1"),
+    "chest": (
+        "thorax",
+        "chest",
+        "spinechest",
+        "spine02",
+        "spine2",
+        "spine1",
+        "upperback",
+        "spinemid",
+    ),
+    "neck": ("lowerneck", "spineshoulder", "necktwist01", "neck", "neck01", "neck1"),
     "head": ("head",),
 }
 _SIDE_ALIASES: dict[str, tuple[str, ...]] = {
@@ -28,7 +37,7 @@ _SIDE_ALIASES: dict[str, tuple[str, ...]] = {
 
 def _side_aliases(side: str, part: str) -> tuple[str, ...]:
     words = [f"{token}{alias}" for alias in _SIDE_ALIASES[part] for token in (side, side[0])]
-    words += [f"{alias}{side[0]}" for alias in _SIDE_ALIASES[part]]
+    words += [f"{alias}{token}" for alias in _SIDE_ALIASES[part] for token in (side[0], side)]
     # ASF splits the forearm at "lwrist" and starts "lhand" at the wrist.
     return (f"{side[0]}hand", *words) if part == "hand" else tuple(words)
 
@@ -37,6 +46,22 @@ ALIASES: dict[str, tuple[str, ...]] = _CENTER_ALIASES | {
     f"{side}_{part}": _side_aliases(side, part)
     for side in ("left", "right")
     for part in _SIDE_ALIASES
+}
+
+# Points of the head, by the names they go by: they tell where it is, and move with it.
+FACE_ALIASES: dict[str, tuple[str, ...]] = {"nose": ("nose",), "mouth": ("mouth", "jaw")} | {
+    f"{side}_{part}": tuple(
+        name
+        for alias in aliases
+        for token in (side, side[0])
+        for name in (f"{token}{alias}", f"{alias}{token}")
+    )
+    for side in ("left", "right")
+    for part, aliases in {
+        "ear": ("ear",),
+        "eye": ("eye",),
+        "cheek": ("eyeinner", "eyeouter", "mouth"),
+    }.items()
 }
 
 REQUIRED = tuple(
@@ -60,10 +85,11 @@ def both_sides(table: Mapping[str, Weights], left: str, right: str) -> dict[str,
     return {**table, **mirrored}
 
 
-# Estimates of body21 joints from others of body21, used in this order for joints without a source.
-# The ratios are means over the training archives (hips to 5 mm, trunk to 2 to 4 cm).
+# Estimates of body21 joints from others, used in this order for joints without a source. The
+# ratios are means over the training archives (hips to 5 mm, trunk to 2 to 4 cm).
 ESTIMATES: dict[str, Weights] = both_sides(
     {
+        "head": {"left_ear": 0.5, "right_ear": 0.5},
         "hips": {
             "left_upper_leg": 0.4785,
             "right_upper_leg": 0.4785,
@@ -158,3 +184,43 @@ H36M17_FROM_BODY21: Mapping[str, Weights] = {
     "Neck": {"neck": 0.4, "head": 0.6},
     "Head": {"neck": -0.4, "head": 1.4},
 } | {h36m: {body21: 1.0} for h36m, body21 in _H36M_LIMBS.items()}
+
+BODY21_FROM_SMPL24 = BODY21_FROM_SMPL22
+SMPL24_FROM_BODY21: Mapping[str, Weights] = both_sides(
+    {**SMPL22_FROM_BODY21, "left_hand": {"left_hand": 1.33, "left_lower_arm": -0.33}},
+    "left_",
+    "right_",
+)
+
+# Kinect's SpineMid lies halfway up the trunk, and its SpineShoulder where body21 has the neck.
+BODY21_FROM_KINECT25: Mapping[str, Weights] = {
+    "hips": {"SpineBase": 1.0},
+    "spine": {"SpineBase": 0.42, "SpineMid": 0.58},
+    "chest": {"SpineMid": 0.72, "SpineShoulder": 0.28},
+    "neck": {"SpineShoulder": 1.0},
+    "head": {"Head": 1.0},
+} | {
+    f"{side.lower()}_{part}": {f"{kinect}{side}": 1.0}
+    for side in ("Left", "Right")
+    for part, kinect in {
+        "upper_arm": "Shoulder",
+        "lower_arm": "Elbow",
+        "hand": "Wrist",
+        "upper_leg": "Hip",
+        "lower_leg": "Knee",
+        "foot": "Ankle",
+        "toes": "Foot",
+    }.items()
+}
+KINECT25_FROM_BODY21: Mapping[str, Weights] = {
+    "SpineBase": {"hips": 1.0},
+    "SpineMid": {"spine": 0.4, "chest": 0.6},
+    "SpineShoulder": {"neck": 1.0},
+    "Neck": {"neck": 0.5, "head": 0.5},
+    "Head": {"head": 1.0},
+} | {
+    kinect: {body21: 1.0}
+    for body21, row in BODY21_FROM_KINECT25.items()
+    if "_" in body21
+    for kinect in row
+}

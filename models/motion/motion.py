@@ -13,8 +13,9 @@ from models.motion.skeleton import Skeleton, SkeletonError, joint_map
 class Motion:
     """Joint positions of one person in the world.
 
-    `positions` are metres, right-handed, +Z up. `rotations` are (w, x, y, z), each joint relative
-    to its parent, the root to the world; `rest_offsets` are the bone vectors at the identity.
+    `positions` are metres, right-handed, +Z up, NaN where a joint was not seen. `rotations` are
+    (w, x, y, z), each joint relative to its parent, the root to the world; `rest_offsets` are the
+    bone vectors at the identity.
     """
 
     name: str

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,14 +13,20 @@ from jaxtyping import Bool, Float
 from models.motion.joint_tables import (
     ALIASES,
     BODY21_FROM_H36M17,
+    BODY21_FROM_KINECT25,
     BODY21_FROM_SMPL22,
+    BODY21_FROM_SMPL24,
     ESTIMATES,
+    FACE_ALIASES,
     H36M17_FROM_BODY21,
+    KINECT25_FROM_BODY21,
     PLACEHOLDERS,
     REQUIRED,
     SMPL22_FROM_BODY21,
+    SMPL24_FROM_BODY21,
     Weights,
 )
+from models.motion.standards import STANDARDS
 
 Side = Literal["left", "right", "center"]
 
@@ -147,42 +153,65 @@ def _side(joint: str, joints: frozenset[str]) -> Side:
     return "left" if joint.startswith("l") else "right"
 
 
-def _standard(name: str, table: Sequence[tuple[str, int]]) -> Skeleton:
-    return Skeleton(
-        name=name, joints=tuple(j for j, _ in table), parents=tuple(p for _, p in table)
-    )
+def parents_first(parents: Sequence[int]) -> tuple[int, ...]:
+    """The indices of a tree's joints in an order that puts parents before their children.
+
+    Raises:
+        SkeletonError: It is no tree.
+    """
+    num_joints = len(parents)
+    if not all(-1 <= parent < num_joints for parent in parents):
+        raise SkeletonError(
+            f"parents: found {list(parents)[:40]}; each must be an index from -1 (the root) to "
+            f"{num_joints - 1}."
+        )
+    if all(parent < joint for joint, parent in enumerate(parents)) and parents[1:].count(-1) == 0:
+        return tuple(range(num_joints))
+    roots = [joint for joint, parent in enumerate(parents) if parent < 0]
+    order = list(roots)
+    for joint in order:
+        order += [child for child, parent in enumerate(parents) if parent == joint]
+    if len(roots) != 1 or len(order) != num_joints:
+        raise SkeletonError("parents: found no tree; exactly one joint has -1 and none is a loop.")
+    return tuple(order)
 
 
-# fmt: off
-BODY21 = _standard("body21", (
-    ("hips", -1), ("spine", 0), ("chest", 1), ("neck", 2), ("head", 3),
-    ("left_shoulder", 2), ("left_upper_arm", 5), ("left_lower_arm", 6), ("left_hand", 7),
-    ("right_shoulder", 2), ("right_upper_arm", 9), ("right_lower_arm", 10), ("right_hand", 11),
-    ("left_upper_leg", 0), ("left_lower_leg", 13), ("left_foot", 14), ("left_toes", 15),
-    ("right_upper_leg", 0), ("right_lower_leg", 17), ("right_foot", 18), ("right_toes", 19),
-))
-SMPL22 = _standard("smpl22", (
-    ("pelvis", -1), ("left_hip", 0), ("right_hip", 0), ("spine1", 0),
-    ("left_knee", 1), ("right_knee", 2), ("spine2", 3), ("left_ankle", 4), ("right_ankle", 5),
-    ("spine3", 6), ("left_foot", 7), ("right_foot", 8), ("neck", 9),
-    ("left_collar", 9), ("right_collar", 9), ("head", 12),
-    ("left_shoulder", 13), ("right_shoulder", 14), ("left_elbow", 16), ("right_elbow", 17),
-    ("left_wrist", 18), ("right_wrist", 19),
-))
-H36M17 = _standard("h36m17", (
-    ("Hip", -1), ("RHip", 0), ("RKnee", 1), ("RAnkle", 2), ("LHip", 0), ("LKnee", 4),
-    ("LAnkle", 5), ("Spine", 0), ("Thorax", 7), ("Neck", 8), ("Head", 9),
-    ("LShoulder", 8), ("LElbow", 11), ("LWrist", 12), ("RShoulder", 8), ("RElbow", 14),
-    ("RWrist", 15),
-))
-# fmt: on
-SKELETONS: dict[str, Skeleton] = {s.name: s for s in (BODY21, SMPL22, H36M17)}
+def in_tree_order(
+    name: str,
+    joints: Sequence[str],
+    parents: Sequence[int],
+    mapping: tuple[tuple[str, str], ...] = (),
+) -> tuple[Skeleton, tuple[int, ...]]:
+    """A skeleton of joints in any order, and for each joint of it the index in that order.
 
+    Raises:
+        SkeletonError: They are no tree of named joints.
+    """
+    if len(parents) != len(joints):
+        raise SkeletonError(
+            f"parents: found {len(parents)}; there must be one for each of {len(joints)} joints."
+        )
+    order = parents_first(tuple(parents))
+    place = {joint: i for i, joint in enumerate(order)}
+    tree = tuple(-1 if parents[joint] < 0 else place[parents[joint]] for joint in order)
+    names = tuple(joints[joint] for joint in order)
+    return Skeleton(name=name, joints=names, parents=tree, mapping=mapping), order
+
+
+_TREES = {name: in_tree_order(name, s.joints, s.parents) for name, s in STANDARDS.items()}
+SKELETONS: dict[str, Skeleton] = {name: tree for name, (tree, _) in _TREES.items()}
+SENT_ORDERS: dict[str, tuple[int, ...]] = {name: order for name, (_, order) in _TREES.items()}
+"""For each joint of a standard skeleton its index in the order in which its source sends it."""
+BODY21, SMPL22, H36M17 = SKELETONS["body21"], SKELETONS["smpl22"], SKELETONS["h36m17"]
+
+_Tables: TypeAlias = tuple[Mapping[str, Weights], Mapping[str, Weights]]
 _IDENTITY: Mapping[str, Weights] = {joint: {joint: 1.0} for joint in BODY21.joints}
-_TABLES: dict[frozenset[str], tuple[Mapping[str, Weights], Mapping[str, Weights]]] = {
-    frozenset(BODY21.joints): (_IDENTITY, _IDENTITY),
-    frozenset(SMPL22.joints): (BODY21_FROM_SMPL22, SMPL22_FROM_BODY21),
-    frozenset(H36M17.joints): (BODY21_FROM_H36M17, H36M17_FROM_BODY21),
+_TABLES: dict[str, _Tables] = {
+    "body21": (_IDENTITY, _IDENTITY),
+    "smpl22": (BODY21_FROM_SMPL22, SMPL22_FROM_BODY21),
+    "smpl24": (BODY21_FROM_SMPL24, SMPL24_FROM_BODY21),
+    "h36m17": (BODY21_FROM_H36M17, H36M17_FROM_BODY21),
+    "kinect25": (BODY21_FROM_KINECT25, KINECT25_FROM_BODY21),
 }
 
 
@@ -234,10 +263,26 @@ def skeleton_from_names(
     return skeleton
 
 
-def _standard_tables(
-    skeleton: Skeleton,
-) -> tuple[Mapping[str, Weights], Mapping[str, Weights]] | None:
-    return None if skeleton.mapping else _TABLES.get(frozenset(skeleton.joints))
+def _standard_tables(skeleton: Skeleton) -> _Tables | None:
+    """The tables of the standard skeleton that this one is, or of whose joints it has some."""
+    if skeleton.mapping:
+        return None
+    joints = set(skeleton.joints)
+    for name, tables in _TABLES.items():
+        own = set(SKELETONS[name].joints)
+        if joints == own or (skeleton.name == name and joints < own):
+            return tables
+    return None
+
+
+def _faces(skeleton: Skeleton) -> Mapping[str, str]:
+    """The points of the head that the skeleton has: {its name: what it is}."""
+    meant = {alias: point for point, aliases in FACE_ALIASES.items() for alias in aliases}
+    return {
+        joint: meant[_plain(joint)]
+        for joint in skeleton.joints
+        if not skeleton.mapping and _plain(joint) in meant
+    }
 
 
 def _matrix(rows: Sequence[Weights], columns: Sequence[str]) -> Float[np.ndarray, "rows columns"]:
@@ -254,17 +299,19 @@ def _to_body21(
 ) -> tuple[Float[np.ndarray, "21 Js"], Bool[np.ndarray, "21"]]:
     tables = _standard_tables(source)
     found = tables[0] if tables else {b: {own: 1.0} for b, own in resolve_joints(source).items()}
+    found = {joint: row for joint, row in found.items() if set(row) <= set(source.joints)}
     missing = [joint for joint in REQUIRED if joint not in found]
     if missing:
         raise SkeletonError(
             f"{source.name}.joints: found nothing for {', '.join(missing)}; both upper legs, "
             "knees (lower_leg), ankles (foot) and upper arms are needed: name them in `map`."
         )
+    found = {point: {own: 1.0} for own, point in _faces(source).items()} | found
     rows = {joint: _matrix([row], source.joints)[0] for joint, row in found.items()}
     known = set(rows)
     for table in (ESTIMATES, PLACEHOLDERS):
         for joint, row in table.items():
-            if joint not in rows:
+            if joint not in rows and set(row) <= rows.keys():
                 rows[joint] = np.sum([w * rows[other] for other, w in row.items()], axis=0)
         known |= set(rows) if table is ESTIMATES else set()
     weights = np.stack([rows[joint] for joint in BODY21.joints])
@@ -277,9 +324,10 @@ def _from_body21(
     tables = _standard_tables(target)
     own = {own: body21 for body21, own in resolve_joints(target).items()}
     table = tables[1] if tables else {joint: {body21: 1.0} for joint, body21 in own.items()}
+    faces = _faces(target)
     rows: list[Weights] = []
     for joint, parent in zip(target.joints, target.parents, strict=True):
-        above = rows[parent] if parent >= 0 else {"hips": 1.0}
+        above = {"head": 1.0} if joint in faces else rows[parent] if parent >= 0 else {"hips": 1.0}
         rows.append(table.get(joint, above))
     known = np.array([joint in table for joint in target.joints])
     return _matrix(rows, BODY21.joints), known

@@ -64,18 +64,19 @@ def smpl_motion(
     turn: Float[np.ndarray, "4"],
     name: str,
     fps: float,
+    path: Float[np.ndarray, "T 3"] | None = None,
 ) -> Motion:
-    """The motion of rotations without a path, in a world that is turned by ``turn``.
+    """The motion of rotations in a world that is turned by ``turn``.
 
-    The root stays at the origin, so people who crouch lift their feet.
+    Without a path the root stays at the origin, so people who crouch lift their feet.
     """
     turned = rotations.copy()
     turned[:, 0] = rot.multiply(turn, rotations[:, 0])
-    origin = np.zeros((len(rotations), 3))
+    root = np.zeros((len(rotations), 3)) if path is None else path
     return Motion(
         name=name,
         skeleton=SMPL22,
-        positions=forward_kinematics(turned, REST_OFFSETS, SMPL22.parents, origin),
+        positions=forward_kinematics(turned, REST_OFFSETS, SMPL22.parents, root),
         fps=fps,
         rotations=rot.continuous_sign(turned),
         rest_offsets=REST_OFFSETS,

@@ -48,7 +48,8 @@ def manifest(actions_bundle: Path) -> Manifest:
 def test_answer_says_all_there_is_to_know(performing_service: Service):
     answer = answered(performing_service, num_samples=6, skeleton="body21", fps=30)
     assert set(answer) == {
-        "id", "model", "seed", "fps", "skeleton", "joints", "futures", "warnings", "timing_ms",
+        "id", "model", "seed", "fps", "skeleton", "joints", "joint_sources", "futures", "warnings",
+        "timing_ms",
     }  # fmt: skip
     assert answer["model"]["name"] == "actions"
     assert (answer["seed"], answer["fps"], answer["skeleton"]) == (5, 30, "body21")
@@ -228,7 +229,8 @@ CASES = [
     ("invalid-field", "/max_seconds_per_action", fields(max_seconds_per_action=0.01), "0.01 s"),
     ("invalid-field", "/num_steps", fields(num_steps=1), "a field that is not known"),
     ("invalid-field", "/num_samples", fields(num_samples=201), "201"),
-    ("invalid-field", "/num_samples", fields(num_samples=200, actions=["wave"] * 16, fps=60),
+    ("invalid-field", "/num_samples", fields(num_samples=200, actions=["wave"] * 16, fps=60,
+                                                poses=walking(30, fps=60.0)),
      "200 futures of up to 1920 frames"),
     ("too-few-frames", "/poses", fields(poses=WALK[:14]), "14 frames at 30 fps"),
     ("unknown-skeleton", "/skeleton", fields(skeleton="octopus"), "'octopus'"),

@@ -195,6 +195,7 @@ def busy(status: int = 429, retry_after: str = "0") -> Callable[[], Response]:
 def answered() -> Response:
     content = {
         "id": "1", "model": {"name": "m"}, "seed": 1, "fps": 30.0, "joints": ["hips"],
+        "joint_sources": ["observed"],
         "num_frames": 1, "futures": [[[[0.0, 0.0, 1.0]]]], "warnings": [],
         "steps": {"run": 1, "of": 1, "stopped_by": "end"}, "timing_ms": {"engine": 2.5},
     }  # fmt: skip

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from tiny_bundles import standing_pose, walking
 
 from models.bundle import Manifest, read_manifest
+from models.motion.axes import Axes
 from models.motion.skeleton import BODY21, H36M17, joint_map
-from service.axes import Axes
 from service.errors import InputError, PosesError, TooFewFramesError, UnknownSkeletonError
 from service.futures import caller_futures
 from service.observation import Observation, frames_needed, read_observation

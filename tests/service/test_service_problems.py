@@ -209,6 +209,7 @@ def test_every_problem_of_the_tree_is_reached_by_these_tests():
         "unsuitable-model", "unknown-action",  # test_service_actions
         "deadline-too-short",  # test_service_http
         "not-acceptable",  # test_service_media
+        "unreadable-file",  # test_service_files
         "overloaded", "rate-limited", "unauthorised",  # test_service_overload
         "cancelled", "unknown-request",  # test_service_delivery
     }  # fmt: skip

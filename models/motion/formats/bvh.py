@@ -1,6 +1,5 @@
 """BVH files: read into metres with +Z up, and written for animation tools."""
 
-import math
 from collections.abc import Iterator, Sequence
 from io import TextIOBase
 from pathlib import Path
@@ -12,8 +11,10 @@ from models.motion import rotations as rot
 from models.motion.formats.bvh_hierarchy import Joint, read_hierarchy
 from models.motion.formats.bvh_rows import frames_per_second, read_counts, read_rows
 from models.motion.formats.text import read_lines
-from models.motion.kinematics import global_rotations, inverse_kinematics, rest_pose
+from models.motion.guesses import plausible_factor
+from models.motion.kinematics import global_rotations
 from models.motion.motion import Motion
+from models.motion.rig import Rig, rigged
 from models.motion.skeleton import Skeleton, resolve_joints
 
 UNITS_M = (0.01, 1.0, 0.001, 0.0254 / 0.45, 0.0254)  # cm, metre, mm, CMU's unit, inch
@@ -21,7 +22,6 @@ _ORDER = "ZXY"
 _ROTATION_CHANNELS = " ".join(f"{axis}rotation" for axis in _ORDER)
 _POSITION_CHANNELS = "Xposition Yposition Zposition"
 _TIP = 0.3  # length of an End Site as a part of the bone before it
-_LEGS_M = (0.4, 1.15)  # hip to ankle, from a child of four to a very tall adult
 _LEG_PER_REACH = 0.7  # hip to ankle as a part of the longest chain of bones from the hips
 
 
@@ -72,8 +72,7 @@ def guess_scale(offsets: Float[np.ndarray, "J 3"], skeleton: Skeleton) -> float:
     bones = [found[joint] for joint in ("left_lower_leg", "left_foot") if joint in found]
     leg = float(sum(lengths[skeleton.index(bone)] for bone in bones))
     leg = leg or _reach(lengths, skeleton) * _LEG_PER_REACH
-    plausible = (unit for unit in UNITS_M if _LEGS_M[0] <= leg * unit <= _LEGS_M[1])
-    return next(plausible, 0.01 if leg == 0 else min(UNITS_M, key=lambda u: abs(math.log(leg * u))))
+    return plausible_factor(leg, UNITS_M) if leg else UNITS_M[0]
 
 
 def _reach(lengths: Float[np.ndarray, "J"], skeleton: Skeleton) -> float:
@@ -132,59 +131,24 @@ def write_bvh(
 ) -> None:
     """Writes a motion so that `read_bvh` finds its positions again, by default to 0.1 mm.
 
-    Rotations are the motion's own, or else those of `inverse_kinematics` from a T-pose. A joint
-    that its rigid bone would miss by more than the tolerance gets position channels as well.
+    Rotations are those of its `rig`; joints that move there get position channels as well.
     """
     if isinstance(path_or_file, Path):
         with path_or_file.open("w", encoding="utf-8") as file:
             write_bvh(file, motion, tolerance_m=tolerance_m)
         return
-    rotations, rest = _rotations_and_rest(motion)
-    moving, translations = _translations(motion, rotations, rest, tolerance_m)
+    rig = rigged(motion, tolerance_m=tolerance_m)
     columns: list[Float[np.ndarray, "T C"]] = []
     for j in _depth_first(motion):
-        if moving[j]:
-            columns.append(translations[:, j][:, [1, 2, 0]] * 100.0)
-        angles = rot.to_euler(rotations[:, j][:, [0, 2, 3, 1]], _ORDER)
+        if rig.moving[j]:
+            columns.append(rig.translations[:, j][:, [1, 2, 0]] * 100.0)
+        angles = rot.to_euler(rig.rotations[:, j][:, [0, 2, 3, 1]], _ORDER)
         columns.append(np.degrees(np.unwrap(angles, axis=0)))
     path_or_file.write("HIERARCHY\n")
-    path_or_file.writelines(f"{line}\n" for line in _joint_lines(motion, rest, moving, 0, 0))
+    path_or_file.writelines(f"{line}\n" for line in _joint_lines(motion, rig, 0, 0))
     path_or_file.write(f"MOTION\nFrames: {motion.num_frames}\n")
     path_or_file.write(f"Frame Time: {1.0 / motion.fps:.9f}\n")
     np.savetxt(path_or_file, np.concatenate(columns, axis=1), fmt="%.6f")
-
-
-def _rotations_and_rest(
-    motion: Motion,
-) -> tuple[Float[np.ndarray, "T J 4"], Float[np.ndarray, "J 3"]]:
-    if motion.rotations is not None and motion.rest_offsets is not None:
-        rotations = rot.normalise(motion.rotations.astype(np.float64))
-        return rotations, motion.rest_offsets.astype(np.float64)
-    rest = rest_pose(motion.positions, motion.skeleton)
-    return inverse_kinematics(motion.positions, rest, motion.skeleton.parents), rest
-
-
-def _translations(
-    motion: Motion,
-    rotations: Float[np.ndarray, "T J 4"],
-    rest: Float[np.ndarray, "J 3"],
-    tolerance_m: float,
-) -> tuple[list[bool], Float[np.ndarray, "T J 3"]]:
-    """Which joints need position channels, and every joint's place in its parent's frame."""
-    positions = motion.positions.astype(np.float64)
-    turned = global_rotations(rotations, motion.skeleton.parents)
-    written = positions.copy()
-    translations = positions.copy()
-    moving = [True] * motion.skeleton.num_joints
-    for j, parent in enumerate(motion.skeleton.parents):
-        if parent < 0:
-            continue
-        bone = positions[:, j] - written[:, parent]
-        translations[:, j] = rot.rotate(rot.conjugate(turned[:, parent]), bone)
-        rigid = written[:, parent] + rot.rotate(turned[:, parent], rest[j])
-        moving[j] = bool(np.linalg.norm(rigid - positions[:, j], axis=-1).max() > tolerance_m)
-        written[:, j] = positions[:, j] if moving[j] else rigid
-    return moving, translations
 
 
 def _depth_first(motion: Motion, joint: int = 0) -> Iterator[int]:
@@ -193,19 +157,17 @@ def _depth_first(motion: Motion, joint: int = 0) -> Iterator[int]:
         yield from _depth_first(motion, child)
 
 
-def _joint_lines(
-    motion: Motion, rest: Float[np.ndarray, "J 3"], moving: list[bool], joint: int, depth: int
-) -> Iterator[str]:
+def _joint_lines(motion: Motion, rig: Rig, joint: int, depth: int) -> Iterator[str]:
     indent = "  " * depth
-    x, y, z = rest[joint, [1, 2, 0]] * (100.0 if joint else 0.0)
-    channels = f"6 {_POSITION_CHANNELS}" if moving[joint] else "3"
+    x, y, z = rig.rest[joint, [1, 2, 0]] * (100.0 if joint else 0.0)
+    channels = f"6 {_POSITION_CHANNELS}" if rig.moving[joint] else "3"
     yield f"{indent}{'JOINT' if joint else 'ROOT'} {motion.skeleton.joints[joint]}"
     yield f"{indent}{{"
     yield f"{indent}  OFFSET {x:.6f} {y:.6f} {z:.6f}"
     yield f"{indent}  CHANNELS {channels} {_ROTATION_CHANNELS}"
     children = motion.skeleton.children[joint]
     for child in children:
-        yield from _joint_lines(motion, rest, moving, child, depth + 1)
+        yield from _joint_lines(motion, rig, child, depth + 1)
     if not children:
         tip = f"{_TIP * x:.6f} {_TIP * y:.6f} {_TIP * z:.6f}"
         yield from (f"{indent}  End Site", f"{indent}  {{", f"{indent}    OFFSET {tip}")

@@ -24,7 +24,7 @@ _ONE = 32767
 _TEXTS = ("name", "action", "style", "subject", "split", "source", "description")
 _FRAME_SHAPES = {"positions": (21, 3), "root": (3,), "rotations": (21, 4)}
 _KINDS = {"positions": "i", "root": "f", "rotations": "i", "rest_offsets": "f", "clip_floor": "f"}
-_DAMAGE = (  # what numpy and zipfile raise on damaged archives
+DAMAGE = (  # what numpy and zipfile raise on damaged archives
     zipfile.BadZipFile, zlib.error, OSError, EOFError, KeyError, ValueError, TypeError,
     SyntaxError, NotImplementedError, RuntimeError, MemoryError, OverflowError,
     AttributeError,
@@ -166,7 +166,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         try:
             with np.load(file, allow_pickle=False) as archive:
                 return {key: archive[key] for key in archive.files}
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise MalformedFileError(
                 path.name,
                 found=f"{type(error).__name__} ({error})",

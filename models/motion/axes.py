@@ -1,4 +1,4 @@
-"""The caller's coordinates: which axis points up, and how long a unit is."""
+"""Coordinates: which axis points up, how long a unit is, and whether they are right-handed."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,10 +8,11 @@ from jaxtyping import Float
 
 Up = Literal["x", "-x", "y", "-y", "z", "-z"]
 Units = Literal["m", "cm", "mm"]
+Handed = Literal["right", "left"]
 
 UNITS_PER_METRE: dict[Units, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 
-# Rows give our x, y and z in the caller's axes; all are rotations, so nobody is mirrored.
+# Rows give our x, y and z in the others' axes; all are rotations, so nobody is mirrored.
 _TO_Z_UP: dict[Up, tuple[tuple[int, int, int], ...]] = {
     "x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
     "-x": ((0, 1, 0), (0, 0, -1), (-1, 0, 0)),
@@ -24,18 +25,22 @@ _TO_Z_UP: dict[Up, tuple[tuple[int, int, int], ...]] = {
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Axes:
-    """Right-handed axes with an up direction and a unit."""
+    """Axes with an up direction and a unit; `handed` is left in Unity and Unreal."""
 
     up: Up = "z"
     units: Units = "m"
+    handed: Handed = "right"
 
     def to_metres(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """The caller's points in metres, Z up."""
+        """Points in these axes as metres, +Z up, right-handed."""
         return np.asarray((points / UNITS_PER_METRE[self.units]) @ self._matrix().T)
 
     def from_metres(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Points in metres, Z up, as the caller writes them."""
+        """Points in metres, +Z up, right-handed, in these axes."""
         return np.asarray(points @ self._matrix() * UNITS_PER_METRE[self.units])
 
     def _matrix(self) -> Float[np.ndarray, "3 3"]:
-        return np.array(_TO_Z_UP[self.up], dtype=np.float64)
+        matrix = np.array(_TO_Z_UP[self.up], dtype=np.float64)
+        if self.handed == "left":  # a left-handed world is a right-handed one seen in a mirror
+            matrix[1] *= -1.0
+        return matrix

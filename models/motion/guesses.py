@@ -1,0 +1,75 @@
+"""What positions alone tell of a person: which axis is up, and how long a unit is."""
+
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from models.motion.axes import UNITS_PER_METRE, Units, Up
+from models.motion.skeleton import BODY21, Skeleton, joint_map
+
+LEGS_M = (0.4, 1.15)  # hip to ankle, from a child of four to a very tall adult
+_UPS: tuple[tuple[Up, Up], ...] = (("x", "-x"), ("y", "-y"), ("z", "-z"))
+
+
+def body_of(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> dict[str, np.ndarray]:
+    """The paths of body21's joints that can be told, (T, 3) each.
+
+    Raises:
+        SkeletonError: A required joint of body21 is missing.
+    """
+    weights, known = joint_map(skeleton, BODY21)
+    paths: dict[str, np.ndarray] = {}
+    for row, joint, is_known in zip(weights, BODY21.joints, known, strict=True):
+        used = np.flatnonzero(row)
+        if is_known:
+            paths[joint] = np.einsum("j,tjk->tk", row[used], positions[:, used])
+    return paths
+
+
+def guess_up(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> Up:
+    """The axis along which the upper arms are above the feet, most of the time.
+
+    Raises:
+        SkeletonError: A required joint of body21 is missing.
+    """
+    body = body_of(positions, skeleton)
+    upwards = _middle(body, "upper_arm") - _middle(body, "foot")
+    mean = np.median(upwards, axis=0)
+    axis = int(np.abs(mean).argmax())
+    return _UPS[axis][int(mean[axis] < 0)]
+
+
+def leg_length(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> float:
+    """Hip to knee to ankle in units of the positions, the mean of both legs; median over time.
+
+    Raises:
+        SkeletonError: A required joint of body21 is missing.
+    """
+    body = body_of(positions, skeleton)
+    lengths = [
+        np.linalg.norm(body[f"{side}_{lower}"] - body[f"{side}_{upper}"], axis=-1)
+        for side in ("left", "right")
+        for upper, lower in (("upper_leg", "lower_leg"), ("lower_leg", "foot"))
+    ]
+    return float(np.median(np.sum(lengths, axis=0))) / 2.0
+
+
+def guess_units(leg: float) -> Units:
+    """The unit that makes a leg of this length one of a person, or nearly so."""
+    factors: dict[Units, float] = {unit: 1.0 / per for unit, per in UNITS_PER_METRE.items()}
+    factor = plausible_factor(leg, factors.values())
+    return next(unit for unit in factors if factors[unit] == factor)
+
+
+def plausible_factor(leg: float, factors: Iterable[float]) -> float:
+    """The first factor that makes a leg of this length one of a person; else the one nearest."""
+    tried = tuple(factors)
+    fitting = (factor for factor in tried if LEGS_M[0] <= leg * factor <= LEGS_M[1])
+    nearest = min(tried, key=lambda f: abs(math.log(max(leg * f, 1e-12))))
+    return next(fitting, nearest)
+
+
+def _middle(body: Mapping[str, np.ndarray], part: str) -> Float[np.ndarray, "T 3"]:
+    return np.asarray((body[f"left_{part}"] + body[f"right_{part}"]) / 2.0)
