@@ -2,7 +2,7 @@
 
 import type { Client, ClientMeta, Options as Options2, RequestResult, TDataShape } from './client';
 import { client } from './client.gen';
-import type { ActionsData, ActionsErrors, ActionsResponses, CancelData, CancelErrors, CancelResponses, CancelV1Data, CancelV1Errors, CancelV1Responses, LimitsData, LimitsErrors, LimitsResponses, LivezData, LivezResponses, MetricsData, MetricsErrors, MetricsResponses, ModelData, ModelErrors, ModelResponses, ModelsData, ModelsErrors, ModelsResponses, ObservationsData, ObservationsErrors, ObservationsResponses, PredictActionsData, PredictActionsErrors, PredictActionsResponses, PredictActionsV1Data, PredictActionsV1Errors, PredictActionsV1Responses, PredictData, PredictErrors, PredictResponses, PredictV1Data, PredictV1Errors, PredictV1Responses, ReadyzData, ReadyzErrors, ReadyzResponses, SkeletonsData, SkeletonsErrors, SkeletonsResponses } from './types.gen';
+import type { ActionsData, ActionsErrors, ActionsResponses, CancelData, CancelErrors, CancelResponses, CancelV1Data, CancelV1Errors, CancelV1Responses, LimitsData, LimitsErrors, LimitsResponses, LivezData, LivezResponses, MetricsData, MetricsErrors, MetricsResponses, ModelData, ModelErrors, ModelResponses, ModelsData, ModelsErrors, ModelsResponses, ObservationsData, ObservationsErrors, ObservationsResponses, PredictActionsData, PredictActionsErrors, PredictActionsResponses, PredictActionsV1Data, PredictActionsV1Errors, PredictActionsV1Responses, PredictData, PredictErrors, PredictResponses, PredictV1Data, PredictV1Errors, PredictV1Responses, ReadyzData, ReadyzErrors, ReadyzResponses, SkeletonsData, SkeletonsErrors, SkeletonsResponses, ValidateData, ValidateErrors, ValidateResponses } from './types.gen';
 
 export type Options<TData extends TDataShape = TDataShape, ThrowOnError extends boolean = boolean, TResponse = unknown> = Options2<TData, ThrowOnError, TResponse> & {
     /**
@@ -99,6 +99,22 @@ export const observations = <ThrowOnError extends boolean = false>(options: Opti
     ...options,
     headers: {
         'Content-Type': 'application/octet-stream',
+        ...options.headers
+    }
+});
+
+/**
+ * Validate
+ *
+ * How poses are understood, and what is odd about them; nothing is predicted.
+ *
+ * An unknown skeleton or numbers that are none are errors here as everywhere.
+ */
+export const validate = <ThrowOnError extends boolean = false>(options: Options<ValidateData, ThrowOnError>): RequestResult<ValidateResponses, ValidateErrors, ThrowOnError> => (options.client ?? client).post<ValidateResponses, ValidateErrors, ThrowOnError>({
+    url: '/skeletons/validate',
+    ...options,
+    headers: {
+        'Content-Type': 'application/json',
         ...options.headers
     }
 });

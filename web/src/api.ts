@@ -37,10 +37,16 @@ export interface Preview {
   steps: { run: number; of: number };
 }
 
+let key: string | null = null;
+
 /** Send this key with each request from now on. */
-export function useKey(key: string): void {
-  client.setConfig({ headers: { Authorization: `Bearer ${key}` } });
+export function useKey(wanted: string): void {
+  key = wanted;
+  client.setConfig({ headers: headers() });
 }
+
+/** What goes with each request. */
+export const headers = (): Record<string, string> => (key ? { Authorization: `Bearer ${key}` } : {});
 
 interface Reply<T> {
   data?: T;

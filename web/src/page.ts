@@ -16,7 +16,7 @@ import { Script } from "./script";
 import { Server } from "./server";
 import { DEMOS, demo, fromFiles } from "./sources";
 import { Stage } from "./stage";
-import { asCurl, asPython, type Question, save } from "./take";
+import { asCurl, asPython, type Question, save, type Suffix } from "./take";
 import { Timeline } from "./timeline";
 import { type Solo, View } from "./view";
 import { Webcam } from "./webcam";
@@ -210,7 +210,7 @@ async function showPreview({ futures, steps }: api.Preview): Promise<void> {
 
 function showLook(): void {
   view.setLook({ ...look(), solo });
-  const sample = solo && "sample" in solo ? solo.sample : (answer?.modes[solo?.mode ?? 0]?.sample ?? 0);
+  const sample = chosenSample();
   timeline.setSample(sample);
   script.tell(answer?.segments[sample] ?? [], answer?.fps ?? 1);
   element("legend-truth").hidden = !input("show-truth").checked;
@@ -289,16 +289,23 @@ function copy(written: (question: Question) => string): void {
   );
 }
 
-/** The request for the one future that is shown alone, or else for all. */
-async function download(mediaType: string, suffix: string): Promise<void> {
-  const asked = question();
-  if (!asked) return;
+/** The future that is shown alone, or else all of them, as a file. */
+async function download(suffix: Suffix): Promise<void> {
+  const [asked, told] = [question(), element("take-text")];
+  if (!asked || !motion) return;
+  told.textContent = "…";
   try {
-    await save(asked, mediaType, `${motion?.name.replace(/\.\w+$/, "") ?? "motion"}-futures.${suffix}`);
+    const name = `${motion.name.replace(/\.\w+$/, "")}-future`;
+    told.textContent = `Saved ${await save(asked, suffix, name, solo && chosenSample())}.`;
   } catch (error) {
+    told.textContent = "";
     fail(error);
   }
 }
+
+/** The future that stands for what is shown. */
+const chosenSample = (): number =>
+  solo && "sample" in solo ? solo.sample : (answer?.modes[solo?.mode ?? 0]?.sample ?? 0);
 
 const KEYS: Record<string, () => void> = {
   " ": play,
@@ -348,8 +355,9 @@ function listen(): void {
   });
   button("copy-curl").addEventListener("click", () => copy(asCurl));
   button("copy-python").addEventListener("click", () => copy(asPython));
-  button("save-bvh").addEventListener("click", () => void download("model/bvh", "bvh"));
-  button("save-json").addEventListener("click", () => void download("application/json", "json"));
+  for (const suffix of ["bvh", "glb", "json"] as const) {
+    button(`save-${suffix}`).addEventListener("click", () => void download(suffix));
+  }
   button("webcam").addEventListener("click", () => void watch());
   onPaletteChange(() => view.paint(readPalette()));
   for (const [name, label] of Object.entries(DEMOS)) {

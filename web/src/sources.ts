@@ -56,8 +56,8 @@ function asObserved(text: string): Observed | null {
 }
 
 async function motionOf(found: Observed, name: string): Promise<Motion> {
-  const axes = { ...METRES_Z_UP, ...found.axes };
-  const skeleton = await skeletonOf(found);
+  const { axes: usual, ...skeleton } = await skeletonOf(found);
+  const axes = { ...METRES_Z_UP, ...usual, ...found.axes };
   const track = trackOf(found.poses, axes);
   if (track.joints !== skeleton.joints.length) {
     throw new Error(
@@ -75,8 +75,8 @@ async function motionOf(found: Observed, name: string): Promise<Motion> {
   };
 }
 
-/** Names and parents; joints without parents stand alone. */
-async function skeletonOf({ skeleton, parents, poses }: Observed): Promise<Skeleton> {
+/** Names and parents, and the usual axes; joints without parents stand alone. */
+async function skeletonOf({ skeleton, parents, poses }: Observed): Promise<Skeleton & { axes?: Partial<Axes> }> {
   if (skeleton && typeof skeleton === "object") {
     const alone = skeleton.joints.map(() => -1);
     return { joints: skeleton.joints, parents: parents ?? skeleton.parents ?? alone };
@@ -85,7 +85,7 @@ async function skeletonOf({ skeleton, parents, poses }: Observed): Promise<Skele
   const count = poses[0]?.length;
   const standard =
     skeletons.find(({ name }) => name === skeleton) ??
-    skeletons.find(({ joints }) => joints.length === count);
+    skeletons.find(({ joints }) => !skeleton && joints.length === count);
   if (!standard) throw new Error(`skeleton: found ${skeleton ?? "none"}; GET /skeletons lists them.`);
-  return { joints: standard.joints, parents: parents ?? standard.parents };
+  return { joints: standard.joints, parents: parents ?? standard.parents, axes: standard.axes };
 }
