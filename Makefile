@@ -2,6 +2,7 @@
 # make test         run every check and every test
 # make lint         run the checks alone
 # make format       rewrite the code as `make lint` wants it
+# make page         build the page and its client from web/ into service/viewer; needs Node.js
 # make bench        measure the server and write docs/benchmark.md; BENCH=--quick only prints
 # make clean        remove caches and build outputs; keeps .venv, runs and stores
 
@@ -13,7 +14,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: serve test lint format bench clean
+.PHONY: serve test lint format page bench clean
 
 serve: $(VENV)/.core
 	@$(BIN)/posefutures serve --port $(PORT)
@@ -30,6 +31,11 @@ lint: $(VENV)/.dev
 format: $(VENV)/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+page: $(VENV)/.core
+	cd web && npm ci --no-audit --no-fund
+	$(BIN)/python web/openapi.py > web/openapi.json
+	cd web && npm run client && npm run check && npm run build
 
 bench: $(VENV)/.dev
 	@PYTHONPATH=tests $(BIN)/python -m benchmarks $(BENCH)

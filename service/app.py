@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import partial
+from operator import attrgetter
 from threading import Thread
 from typing import Any
 
@@ -13,6 +14,7 @@ from service import files, predictions, validation
 from service.catalog import Catalog
 from service.guard import Guard
 from service.metrics import Metrics
+from service.page import add_page
 from service.problems import add_problem_responses
 from service.routes import health, router
 from service.settings import Settings
@@ -61,6 +63,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         summary="N plausible futures of a person's 3D motion",
         version="0.1.0",
         lifespan=lifespan,
+        generate_unique_id_function=attrgetter("name"),
         telemetry=telemetry_config(settings.otel_endpoint),
     )
     app.state.settings = settings
@@ -73,6 +76,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.include_router(validation.router)
     app.include_router(router)
     app.include_router(health)
+    add_page(app, pose_landmarker=settings.pose_landmarker)
     add_problem_responses(app)
     keys = [key.get_secret_value() for key in settings.api_keys]
     app.add_middleware(

@@ -11,10 +11,11 @@ from limits.aio.strategies import MovingWindowRateLimiter
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from service import page
 from service.errors import OverloadedError, RateLimitedError, ServiceError, UnauthorisedError
 from service.problems import problem
 
-OPEN_PATHS = ("/livez", "/readyz")
+OPEN_PATHS = ("/livez", "/readyz", page.PATH)
 
 
 class Guard:
@@ -45,7 +46,7 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or answer 401 or 429."""
         app, computes = self._app, scope.get("method") == "POST"
-        if scope["type"] in ("http", "websocket") and scope["path"] not in OPEN_PATHS:
+        if scope["type"] in ("http", "websocket") and not _is_open(scope["path"]):
             try:
                 caller = self._caller(scope)
                 if computes:
@@ -91,6 +92,10 @@ class Guard:
                 "answered.",
                 retry_after_s=max(0.0, window.reset_time - time.time()),
             )
+
+
+def _is_open(path: str) -> bool:
+    return path in OPEN_PATHS or path.startswith(f"{page.FILES_PATH}/")
 
 
 def _digest(key: str) -> bytes:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from limits import parse
-from pydantic import Field, SecretStr, field_validator
+from pydantic import DirectoryPath, Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 import models
@@ -53,6 +53,10 @@ class Settings(BaseSettings):
     )
     rate_limit: str | None = Field(
         default=None, description="of each key, else of each address, such as 60/minute"
+    )
+    pose_landmarker: DirectoryPath | None = Field(
+        default=None,
+        description="folder with MediaPipe's files for the page's webcam: `npm run webcam` in web/",
     )
     otel_endpoint: str | None = Field(
         default=None, validation_alias="OTEL_EXPORTER_OTLP_ENDPOINT", description="takes spans"

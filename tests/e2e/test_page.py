@@ -1,0 +1,282 @@
+"""The page in a real browser, before a real server with the bundles that ship."""
+
+import base64
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from live import until
+from tiny_bundles import walking
+
+from models.motion.formats.bvh import write_bvh
+from models.motion.motion import Motion
+from models.motion.skeleton import BODY21
+from service.settings import Settings
+
+sync_api = pytest.importorskip("playwright.sync_api")
+expect = sync_api.expect
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = (  # software rendering, as the machines of a CI have no GPU
+    "--no-sandbox",
+    "--disable-dev-shm-usage",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)
+PATIENCE_MS = 30_000
+ANSWERED = "#timing[data-futures]"
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+
+
+class Server:
+    """`posefutures serve` on one and the same port, however often it is started."""
+
+    def __init__(self, bundles: Path) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+        self._bundles = bundles
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        command = [sys.executable, "-c", "from service.cli import app; app()"]
+        self._process = subprocess.Popen(
+            [*command, "serve", "--port", str(self.port)],
+            env=os.environ | {"POSEFUTURES_BUNDLES": str(self._bundles)},
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
+        until(self._is_ready)
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+
+    def _is_ready(self) -> bool:
+        try:
+            return httpx.get(f"{self.url}/readyz").is_success
+        except httpx.TransportError:
+            return False
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """Serves the two bundles that answer by default."""
+    shipped, folder = Settings().bundles, tmp_path_factory.mktemp("bundles")
+    shutil.copy(shipped / "DEFAULT", folder)
+    for name in (shipped / "DEFAULT").read_text().split():
+        (folder / name).symlink_to(shipped / name)
+    running = Server(folder)
+    running.start()
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator["sync_api.Browser"]:
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def complaints() -> list[str]:
+    """What the browser's console says is wrong."""
+    return []
+
+
+@pytest.fixture
+def page(
+    browser: "sync_api.Browser", server: Server, complaints: list[str]
+) -> Iterator["sync_api.Page"]:
+    """The page, with futures on it."""
+    context = browser.new_context(
+        viewport={"width": 900, "height": 600},
+        device_scale_factor=0.5,  # a quarter of the pixels: a CPU draws them
+        reduced_motion="reduce",
+        permissions=["clipboard-read", "clipboard-write"],
+        base_url=server.url,
+    )
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE_MS)
+    expect.set_options(timeout=PATIENCE_MS)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("console", lambda said: said.type == "error" and complaints.append(said.text))
+    page.goto("/")
+    page.locator(ANSWERED).wait_for()
+    yield page
+    context.close()
+
+
+def slide(page: "sync_api.Page", slider: str, value: float) -> None:
+    """What a hand does to a slider."""
+    page.locator(slider).evaluate(
+        "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input')) }",
+        value,
+    )
+
+
+def seek(page: "sync_api.Page", seconds: float) -> None:
+    """Look at a time from now, and stay there."""
+    ahead = "() => Number(document.querySelector('#now').value)"
+    slide(page, "#playhead", page.evaluate(ahead) / 30.0 + seconds)
+
+
+def picture(page: "sync_api.Page") -> np.ndarray:
+    """(height, width, 4) the scene as it has just been drawn."""
+    width, height, data = page.evaluate(
+        """() => new Promise((read) => {
+            const canvas = document.querySelector('#canvas');
+            const seek = document.querySelector('#playhead');
+            seek.dispatchEvent(new Event('input'));
+            requestAnimationFrame(() => {
+                const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d');
+                copy.drawImage(canvas, 0, 0);
+                const { width, height, data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+                let text = '';
+                for (let i = 0; i < data.length; i += 8192)
+                    text += String.fromCharCode(...data.subarray(i, i + 8192));
+                read([width, height, btoa(text)]);
+            });
+        })"""
+    )
+    return np.frombuffer(base64.b64decode(data), np.uint8).reshape(height, width, 4)
+
+
+def coloured(image: np.ndarray) -> int:
+    """How many pixels have the colour of a mode: the person and the ground are grey."""
+    channels = image[..., :3].astype(int)
+    spread = channels.max(axis=-1) - channels.min(axis=-1)
+    return int(((spread > 60) & (image[..., 3] > 40)).sum())
+
+
+def test_it_loads_draws_and_complains_of_nothing(page, complaints):
+    page.uncheck("#show-trails")
+    seek(page, -0.5)
+    before = picture(page)
+    seek(page, 1.0)
+    after = picture(page)
+    assert (before[..., 3] > 200).sum() > 300  # the person
+    assert coloured(before) < 20
+    assert coloured(after) > 500  # futures, which there are only after now
+    assert complaints == []
+
+
+def test_the_scrubber_crosses_now_by_keyboard(page):
+    seek(page, 0.0)
+    expect(page.locator("#clock")).to_have_text("now")
+    page.locator("#canvas").focus()
+    page.keyboard.press(".")
+    expect(page.locator("#clock")).to_have_text("+0.03 s")
+    page.keyboard.press(",")
+    page.keyboard.press(",")
+    expect(page.locator("#clock")).to_have_text("−0.03 s")
+    page.keyboard.press(" ")
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
+    page.locator("#now").focus()
+    frame = int(page.locator("#now").input_value())
+    page.keyboard.press("ArrowRight")
+    assert int(page.locator("#now").input_value()) == frame + 1
+
+
+def test_the_number_of_futures_and_the_seed_are_what_the_sliders_say(page):
+    slide(page, "#num-samples", 33)
+    page.locator('#timing[data-futures="33"]').wait_for()
+    assert page.locator("#sample option").count() == 34
+    shares = page.locator("#modes b").all_inner_texts()
+    assert sum(int(share.removesuffix(" %")) for share in shares) == pytest.approx(100, abs=2)
+    slide(page, "#seed", 42)
+    page.locator('#timing[data-seed="42"]').wait_for()
+    seek(page, 1.5)
+    everybody = coloured(picture(page))
+    page.locator("#modes button").last.click()
+    expect(page.locator("#modes button").last).to_have_attribute("aria-pressed", "true")
+    assert coloured(picture(page)) < everybody
+
+
+def test_two_actions_are_composed_and_performed(page):
+    page.locator("label", has=page.locator("#ask-perform")).click()
+    page.click("[data-action=walk-turn-left]")
+    page.click("[data-action=wave-both-hands]")
+    slide(page, "#num-samples", 2)
+    page.click("#perform")
+    page.locator('#timing[data-futures="2"]').wait_for()
+    entries = page.locator("#script li")
+    for entry, name in zip(entries.all(), ("walk turn left", "wave both hands"), strict=True):
+        expect(entry).to_contain_text(name)
+        expect(entry.locator("small")).to_contain_text(" s")  # how long it takes
+
+
+def test_a_dropped_bvh_is_predicted_in_its_own_skeleton(page, tmp_path, complaints):
+    motion = Motion(name="mine", skeleton=BODY21, positions=walking(90, fps=60.0), fps=60.0)
+    write_bvh(tmp_path / "mine.bvh", motion)
+    drop(page, tmp_path / "mine.bvh")
+    expect(page.locator("#motion-text")).to_contain_text("mine: 1.5 s")
+    seek(page, 0.7)
+    assert coloured(picture(page)) > 200
+    assert complaints == []
+
+
+def test_a_file_that_is_no_motion_is_refused_in_a_sentence(page, tmp_path):
+    (tmp_path / "broken.bvh").write_text("no hierarchy")
+    drop(page, tmp_path / "broken.bvh")
+    expect(page.locator("#notice-text")).to_contain_text("broken.bvh")
+    page.click("#notice-close")
+    expect(page.locator("#notice")).to_be_hidden()
+
+
+def drop(page: "sync_api.Page", file: Path) -> None:
+    transfer = page.evaluate_handle(
+        """([name, text]) => {
+            const dropped = new DataTransfer();
+            dropped.items.add(new File([text], name));
+            return dropped;
+        }""",
+        [file.name, file.read_text()],
+    )
+    page.dispatch_event("#stage", "drop", {"dataTransfer": transfer})
+
+
+def test_what_is_copied_runs(page):
+    page.click("#copy-python")
+    expect(page.locator("#take-text")).to_contain_text("Copied")
+    program = page.evaluate("() => navigator.clipboard.readText()")
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert run.stdout.startswith("20 futures by"), run.stderr
+
+
+def test_it_says_when_the_server_is_away_and_goes_on_when_it_is_back(page, server):
+    server.stop()
+    slide(page, "#num-samples", 11)
+    expect(page.locator("#server")).to_contain_text("The server is away")
+    server.start()
+    page.locator('#timing[data-futures="11"]').wait_for()
+    expect(page.locator("#server")).to_contain_text("2 models ready")
+
+
+def test_it_fits_a_phone_and_the_keyboard_reaches_the_controls(page):
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("() => document.documentElement.scrollWidth") == 390
+    page.locator("#play").focus()
+    reached = []
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("() => document.activeElement.id"))
+    for control in ("now", "playhead", "open", "webcam", "ask-predict", "model", "num-samples"):
+        assert control in reached
+
+
+def test_without_mediapipe_the_webcam_says_which_files_are_missing(page):
+    page.click("#webcam")
+    expect(page.locator("#notice-text")).to_contain_text("POSEFUTURES_POSE_LANDMARKER")

@@ -1,0 +1,80 @@
+/** A person before the camera as 33 points, by MediaPipe, whose files an operator may add. */
+
+import type * as MediaPipe from "@mediapipe/tasks-vision";
+import type { Point } from "./motion";
+
+const FOLDER = "/viewer/mediapipe";
+const BUNDLE = `${FOLDER}/vision_bundle.mjs`;
+
+export interface Camera {
+  stop: () => void;
+}
+
+/** Throws, in a sentence for people, where the operator has not added MediaPipe's files. */
+export async function checkFiles(): Promise<void> {
+  const found = await fetch(BUNDLE, { method: "HEAD" }).catch(() => null);
+  if (found?.ok) return;
+  throw new Error(
+    "The webcam needs MediaPipe, which this server does not have. Who runs it sets " +
+      "POSEFUTURES_POSE_LANDMARKER to a folder with vision_bundle.mjs and wasm/ of " +
+      "@mediapipe/tasks-vision 1.1.0 and with the model pose_landmarker.task.",
+  );
+}
+
+/**
+ * Give each pose that is seen to `seen`: metres, x to the right, y down, z away, hips at the origin.
+ *
+ * Throws where the camera may not be used.
+ */
+export async function openCamera(
+  video: HTMLVideoElement,
+  seen: (points: Point[], seconds: number) => void,
+): Promise<Camera> {
+  const stream = await camera();
+  try {
+    const { FilesetResolver, PoseLandmarker } = (await import(BUNDLE)) as typeof MediaPipe;
+    const landmarker = await PoseLandmarker.createFromOptions(
+      await FilesetResolver.forVisionTasks(`${FOLDER}/wasm`),
+      {
+        baseOptions: { modelAssetPath: `${FOLDER}/pose_landmarker.task`, delegate: "GPU" },
+        runningMode: "VIDEO",
+        numPoses: 1,
+      },
+    );
+    video.srcObject = stream;
+    video.hidden = false;
+    await video.play();
+    let running = true;
+    const frame = (milliseconds: number): void => {
+      if (!running) return;
+      const [points] = landmarker.detectForVideo(video, milliseconds).worldLandmarks;
+      if (points) seen(points.map(({ x, y, z }): Point => [x, y, z]), milliseconds / 1000);
+      video.requestVideoFrameCallback(frame);
+    };
+    video.requestVideoFrameCallback(frame);
+    return {
+      stop: () => {
+        running = false;
+        landmarker.close();
+        release(video, stream);
+      },
+    };
+  } catch (cause) {
+    release(video, stream);
+    throw cause;
+  }
+}
+
+async function camera(): Promise<MediaStream> {
+  try {
+    return await navigator.mediaDevices.getUserMedia({ video: { width: 640, height: 480 } });
+  } catch (cause) {
+    throw new Error("The browser gives no camera: it was not allowed, or there is none.", { cause });
+  }
+}
+
+function release(video: HTMLVideoElement, stream: MediaStream): void {
+  for (const track of stream.getTracks()) track.stop();
+  video.srcObject = null;
+  video.hidden = true;
+}
