@@ -42,7 +42,7 @@ HELD_OUT = (
 class Sizes:
     """Widths of a network."""
 
-    latent: int = 12
+    latent: int = 24
     hidden: int = 64
     encoder_layers: int = 1
     shortcuts: bool = True
@@ -175,7 +175,7 @@ def _denoiser_stage(
             num_candidates=candidates,
             reconstruction_weight=5.0,
             weighted_by_signal=False,
-            noisiest_share=0.4,
+            noisiest_share=0.3,
         ),
         trains=("denoiser", "past"),
         num_updates=num_updates,
@@ -220,7 +220,7 @@ def mocap_autoencoder() -> Recipe:
         _mocap_data(HELD_OUT),
         Sizes(),
         _schedule(with_root(BODY21), falling),
-        stages=(_autoencoder_stage(6_000),),
+        stages=(_autoencoder_stage(4_000),),
     )
 
 
@@ -255,7 +255,7 @@ def mocap() -> Recipe:
         _mocap_data(()),
         Sizes(),
         schedule,
-        stages=(_autoencoder_stage(6_000), _denoiser_stage(5_000, schedule)),
+        stages=(_autoencoder_stage(4_000), _denoiser_stage(5_000, schedule)),
     )
 
 
