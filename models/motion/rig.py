@@ -20,7 +20,7 @@ class Rig:
     Where a joint's children do not keep their angles, some hang on joints of their own, which lie
     in it and turn for them: ``hips_to_left_upper_leg``. Bones that stretch cannot be had from
     rotations: their joints, and the root, are ``moving``, and have ``translations``, their places
-    beside the parent; the rest vectors of the former are zero.
+    beside the parent.
     """
 
     joints: tuple[str, ...]
@@ -100,7 +100,7 @@ def rigged(motion: Motion, *, tolerance_m: float = TOLERANCE_M) -> Rig:
             continue
         stretch = np.abs(np.linalg.norm(bone, axis=-1) - np.linalg.norm(rest[j]))
         if stretch.max() > tolerance_m:
-            place.append(rig.add(name, over, turned[:, j], rest=np.zeros(3), beside=beside))
+            place.append(rig.add(name, over, turned[:, j], rest=rest[j], beside=beside))
             continue
         swing = rot.swing(np.broadcast_to(rest[j], beside.shape), beside)
         own = f"{motion.skeleton.joints[parent]}_to_{name}"

@@ -159,7 +159,7 @@ def _depth_first(rig: Rig, joint: int = 0) -> Iterator[int]:
 
 def _joint_lines(rig: Rig, joint: int, depth: int) -> Iterator[str]:
     indent = "  " * depth
-    x, y, z = rig.rest[joint, [1, 2, 0]] * (100.0 if joint else 0.0)
+    x, y, z = np.where(rig.moving[joint], 0.0, 100.0 * rig.rest[joint, [1, 2, 0]])
     channels = f"6 {_POSITION_CHANNELS}" if rig.moving[joint] else "3"
     yield f"{indent}{'JOINT' if joint else 'ROOT'} {rig.joints[joint]}"
     yield f"{indent}{{"
