@@ -1,7 +1,6 @@
 """The page in a real browser, before a real server with the bundles that ship."""
 
 import base64
-import os
 import shutil
 import socket
 import subprocess
@@ -16,6 +15,7 @@ from live import until
 from tiny_bundles import walking
 
 from models.motion.formats.bvh import write_bvh
+from models.motion.formats.files import read_motion
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21
 from service.settings import Settings
@@ -48,10 +48,15 @@ class Server:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        command = [sys.executable, "-c", "from service.cli import app; app()"]
+        program = [sys.executable, "-c", "from service.cli import app; app()"]
         self._process = subprocess.Popen(
-            [*command, "serve", "--port", str(self.port)],
-            env=os.environ | {"POSEFUTURES_BUNDLES": str(self._bundles)},
+            [
+                "env",
+                f"POSEFUTURES_BUNDLES={self._bundles}",
+                *program,
+                "serve",
+                f"--port={self.port}",
+            ],
             stderr=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
         )
@@ -143,7 +148,8 @@ def picture(page: "sync_api.Page") -> np.ndarray:
             requestAnimationFrame(() => {
                 const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d');
                 copy.drawImage(canvas, 0, 0);
-                const { width, height, data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+                const { width, height } = canvas;
+                const { data } = copy.getImageData(0, 0, width, height);
                 let text = '';
                 for (let i = 0; i < data.length; i += 8192)
                     text += String.fromCharCode(...data.subarray(i, i + 8192));
@@ -181,7 +187,7 @@ def test_the_scrubber_crosses_now_by_keyboard(page):
     expect(page.locator("#clock")).to_have_text("+0.03 s")
     page.keyboard.press(",")
     page.keyboard.press(",")
-    expect(page.locator("#clock")).to_have_text("−0.03 s")
+    expect(page.locator("#clock")).to_have_text("\N{MINUS SIGN}0.03 s")
     page.keyboard.press(" ")
     expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
     page.locator("#now").focus()
@@ -246,6 +252,25 @@ def drop(page: "sync_api.Page", file: Path) -> None:
         [file.name, file.read_text()],
     )
     page.dispatch_event("#stage", "drop", {"dataTransfer": transfer})
+
+
+def test_the_denoiser_is_watched_step_by_step(page):
+    page.click("#denoise")
+    page.locator('#preview[data-step="9"]').wait_for(state="attached")
+    expect(page.locator("#preview")).to_be_hidden()  # then the answer is there
+    seek(page, 1.0)
+    assert coloured(picture(page)) > 500
+
+
+def test_the_future_that_is_shown_alone_is_saved_as_a_bvh_that_can_be_read(page, tmp_path):
+    page.select_option("#sample", "3")
+    with page.expect_download() as saved:
+        page.click("#save-bvh")
+    saved.value.save_as(tmp_path / saved.value.suggested_filename)
+    assert saved.value.suggested_filename.endswith("-4.bvh")
+    motion = read_motion(tmp_path / saved.value.suggested_filename)
+    assert motion.positions.shape == (60, 21, 3)
+    assert motion.duration == pytest.approx(2.0, abs=0.05)
 
 
 def test_what_is_copied_runs(page):
