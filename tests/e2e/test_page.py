@@ -32,6 +32,7 @@ FLAGS = (  # software rendering, as the machines of a CI have no GPU
     "--enable-unsafe-swiftshader",
 )
 PATIENCE_MS = 30_000
+DESK = {"width": 900, "height": 600}
 ANSWERED = "#timing[data-futures]"
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
@@ -95,19 +96,19 @@ def browser() -> Iterator["sync_api.Browser"]:
         chromium.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def complaints() -> list[str]:
     """What the browser's console says is wrong."""
     return []
 
 
-@pytest.fixture
-def page(
+@pytest.fixture(scope="module")
+def opened(
     browser: "sync_api.Browser", server: Server, complaints: list[str]
 ) -> Iterator["sync_api.Page"]:
-    """The page, with futures on it."""
+    """The page as it opens: futures are on it, and nothing is wrong."""
     context = browser.new_context(
-        viewport={"width": 900, "height": 600},
+        viewport=DESK,
         device_scale_factor=0.5,  # a quarter of the pixels: a CPU draws them
         reduced_motion="reduce",
         permissions=["clipboard-read", "clipboard-write"],
@@ -120,8 +121,26 @@ def page(
     page.on("console", lambda said: said.type == "error" and complaints.append(said.text))
     page.goto("/")
     page.locator(ANSWERED).wait_for()
+    assert complaints == []
     yield page
     context.close()
+
+
+@pytest.fixture
+def page(opened: "sync_api.Page", complaints: list[str]) -> "sync_api.Page":
+    """The open page with a demo's futures on it, whatever was done with it before."""
+    complaints.clear()
+    opened.set_viewport_size(DESK)
+    opened.locator("label", has=opened.locator("#ask-predict")).click()
+    slide(opened, "#seed", 7)
+    slide(opened, "#num-samples", 20)
+    opened.select_option("#sample", "all")
+    opened.click("[data-demo=hello]")
+    expect(opened.locator("#motion-text")).to_contain_text("hello")
+    opened.click("[data-demo=stroll-and-wave]")
+    expect(opened.locator("#motion-text")).to_contain_text("stroll")
+    opened.locator('#timing[data-futures="20"][data-seed="7"]').wait_for()
+    return opened
 
 
 def slide(page: "sync_api.Page", slider: str, value: float) -> None:
