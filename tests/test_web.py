@@ -1,6 +1,5 @@
 """What is committed of the page is what its sources make: the client and the bundle."""
 
-import os
 import shutil
 import subprocess
 import sys
@@ -18,10 +17,9 @@ pytestmark = pytest.mark.skipif(
 
 
 def npm(script: str, **variables: object) -> None:
-    environment = os.environ | {name: str(value) for name, value in variables.items()}
-    run = subprocess.run(
-        ["npm", "run", script], cwd=WEB, env=environment, capture_output=True, text=True
-    )
+    said = [f"{name}={value}" for name, value in variables.items()]
+    command = ["env", *said, "npm", "run", script]
+    run = subprocess.run(command, cwd=WEB, capture_output=True, text=True)
     assert run.returncode == 0, run.stdout + run.stderr
 
 

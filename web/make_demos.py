@@ -30,7 +30,9 @@ def main(url: str) -> None:
     standing = np.array(EXAMPLE["poses"])
     with Client(url) as client:
         for name, (seed, actions) in DEMOS.items():
-            answer = client.predict_actions(standing, actions, fps=30, num_samples=1, seed=seed, max_seconds_per_action=3)
+            answer = client.predict_actions(
+                standing, actions, fps=30, num_samples=1, seed=seed, max_seconds_per_action=3
+            )
             poses = np.concatenate([standing[10:], answer.futures[0]]).round(3)
             motion = {"name": name, "skeleton": "body21", "fps": 30, "poses": poses.tolist()}
             (FOLDER / f"{name}.json").write_bytes(orjson.dumps(motion))

@@ -1,7 +1,6 @@
 """The page in a real browser, before a real server with the bundles that ship."""
 
 import base64
-import os
 import shutil
 import socket
 import subprocess
@@ -16,6 +15,7 @@ from live import until
 from tiny_bundles import walking
 
 from models.motion.formats.bvh import write_bvh
+from models.motion.formats.files import read_motion
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21
 from service.settings import Settings
@@ -32,6 +32,7 @@ FLAGS = (  # software rendering, as the machines of a CI have no GPU
     "--enable-unsafe-swiftshader",
 )
 PATIENCE_MS = 30_000
+DESK = {"width": 900, "height": 600}
 ANSWERED = "#timing[data-futures]"
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
@@ -48,10 +49,15 @@ class Server:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        command = [sys.executable, "-c", "from service.cli import app; app()"]
+        program = [sys.executable, "-c", "from service.cli import app; app()"]
         self._process = subprocess.Popen(
-            [*command, "serve", "--port", str(self.port)],
-            env=os.environ | {"POSEFUTURES_BUNDLES": str(self._bundles)},
+            [
+                "env",
+                f"POSEFUTURES_BUNDLES={self._bundles}",
+                *program,
+                "serve",
+                f"--port={self.port}",
+            ],
             stderr=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
         )
@@ -90,19 +96,19 @@ def browser() -> Iterator["sync_api.Browser"]:
         chromium.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def complaints() -> list[str]:
     """What the browser's console says is wrong."""
     return []
 
 
-@pytest.fixture
-def page(
+@pytest.fixture(scope="module")
+def opened(
     browser: "sync_api.Browser", server: Server, complaints: list[str]
 ) -> Iterator["sync_api.Page"]:
-    """The page, with futures on it."""
+    """The page as it opens: futures are on it, and nothing is wrong."""
     context = browser.new_context(
-        viewport={"width": 900, "height": 600},
+        viewport=DESK,
         device_scale_factor=0.5,  # a quarter of the pixels: a CPU draws them
         reduced_motion="reduce",
         permissions=["clipboard-read", "clipboard-write"],
@@ -115,8 +121,26 @@ def page(
     page.on("console", lambda said: said.type == "error" and complaints.append(said.text))
     page.goto("/")
     page.locator(ANSWERED).wait_for()
+    assert complaints == []
     yield page
     context.close()
+
+
+@pytest.fixture
+def page(opened: "sync_api.Page", complaints: list[str]) -> "sync_api.Page":
+    """The open page with a demo's futures on it, whatever was done with it before."""
+    complaints.clear()
+    opened.set_viewport_size(DESK)
+    opened.locator("label", has=opened.locator("#ask-predict")).click()
+    slide(opened, "#seed", 7)
+    slide(opened, "#num-samples", 20)
+    opened.select_option("#sample", "all")
+    opened.click("[data-demo=hello]")
+    expect(opened.locator("#motion-text")).to_contain_text("hello")
+    opened.click("[data-demo=stroll-and-wave]")
+    expect(opened.locator("#motion-text")).to_contain_text("stroll")
+    opened.locator('#timing[data-futures="20"][data-seed="7"]').wait_for()
+    return opened
 
 
 def slide(page: "sync_api.Page", slider: str, value: float) -> None:
@@ -143,7 +167,8 @@ def picture(page: "sync_api.Page") -> np.ndarray:
             requestAnimationFrame(() => {
                 const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d');
                 copy.drawImage(canvas, 0, 0);
-                const { width, height, data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+                const { width, height } = canvas;
+                const { data } = copy.getImageData(0, 0, width, height);
                 let text = '';
                 for (let i = 0; i < data.length; i += 8192)
                     text += String.fromCharCode(...data.subarray(i, i + 8192));
@@ -181,7 +206,7 @@ def test_the_scrubber_crosses_now_by_keyboard(page):
     expect(page.locator("#clock")).to_have_text("+0.03 s")
     page.keyboard.press(",")
     page.keyboard.press(",")
-    expect(page.locator("#clock")).to_have_text("−0.03 s")
+    expect(page.locator("#clock")).to_have_text("\N{MINUS SIGN}0.03 s")
     page.keyboard.press(" ")
     expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
     page.locator("#now").focus()
@@ -246,6 +271,25 @@ def drop(page: "sync_api.Page", file: Path) -> None:
         [file.name, file.read_text()],
     )
     page.dispatch_event("#stage", "drop", {"dataTransfer": transfer})
+
+
+def test_the_denoiser_is_watched_step_by_step(page):
+    page.click("#denoise")
+    page.locator('#preview[data-step="9"]').wait_for(state="attached")
+    expect(page.locator("#preview")).to_be_hidden()  # then the answer is there
+    seek(page, 1.0)
+    assert coloured(picture(page)) > 500
+
+
+def test_the_future_that_is_shown_alone_is_saved_as_a_bvh_that_can_be_read(page, tmp_path):
+    page.select_option("#sample", "3")
+    with page.expect_download() as saved:
+        page.click("#save-bvh")
+    saved.value.save_as(tmp_path / saved.value.suggested_filename)
+    assert saved.value.suggested_filename.endswith("-4.bvh")
+    motion = read_motion(tmp_path / saved.value.suggested_filename)
+    assert motion.positions.shape == (60, 21, 3)
+    assert motion.duration == pytest.approx(2.0, abs=0.05)
 
 
 def test_what_is_copied_runs(page):

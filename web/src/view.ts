@@ -156,7 +156,7 @@ export class View {
       }
       figures.end();
     }
-    if (chosen.length > 0) centre.copy(mean.divideScalar(chosen.length));
+    if (chosen.length > 0) centre.lerp(mean.divideScalar(chosen.length), 0.5); // both stay in view
   }
 
   private drawTruth(seconds: number): void {
