@@ -1,6 +1,6 @@
 """The answer to a prediction as bytes, written from arrays without a detour."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -24,7 +24,7 @@ class Answer:
     """Writes the answers to one request, in the worker's thread; then there are ``stages_s``.
 
     Numbers are rounded to 0.1 mm. Equal requests of equal ids have equal bytes up to ``timing_ms``,
-    which comes last.
+    which comes last. Where something goes ``beside`` it, the answer is under ``answer``.
     """
 
     id: str
@@ -37,6 +37,7 @@ class Answer:
     returned: Sequence[str] = ("futures",)
     num_modes: int = 1
     levels: Sequence[float] = ()
+    beside: Mapping[str, Any] = field(default_factory=dict)
     stages_s: dict[str, float] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
 
@@ -58,7 +59,9 @@ class Answer:
             "engine": timing.engine_s,
             "answer": perf_counter() - started_s,
         }
-        body = encoded(content | {"timing_ms": self.milliseconds()}, self.media_type)
+        content |= {"timing_ms": self.milliseconds()}
+        message = {**self.beside, "answer": content} if self.beside else content
+        body = encoded(message, self.media_type)
         self.stages_s["answer"] = perf_counter() - started_s
         self.facts |= {
             "steps_run": result.steps_run,

@@ -9,12 +9,13 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from service import predictions
+from service import live, predictions
 from service.catalog import Catalog
 from service.guard import Guard
 from service.metrics import Metrics
 from service.problems import add_problem_responses
 from service.routes import health, router
+from service.sessions import Sessions
 from service.settings import Settings
 from service.telemetry import telemetry_config
 from service.visits import Visits
@@ -68,7 +69,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.metrics = metrics
     app.state.draining = False
     app.state.streams = set()
+    app.state.sessions = Sessions(most=settings.max_streams)
     app.include_router(predictions.router)
+    app.include_router(live.router)
     app.include_router(router)
     app.include_router(health)
     add_problem_responses(app)

@@ -2,7 +2,8 @@
 
 import asyncio
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from math import ceil
 from time import perf_counter
 from typing import Annotated, Any
@@ -17,6 +18,7 @@ from service.actions import action_indices, max_frames
 from service.answer import Answer
 from service.axes import Axes
 from service.body import BodyRoute
+from service.catalog import Catalog
 from service.delivery import Stream, event, unless_gone
 from service.dependencies import TheCatalog, TheSettings, metrics_of, settings_of, visit_of
 from service.engine import trajectory
@@ -125,40 +127,15 @@ async def predict(
 ) -> Response:
     """N futures of the person in the poses, in the caller's world, skeleton and frame rate."""
     media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *STREAMS))
-    manifest, worker = catalog.ready(body.model, with_actions=False)
-    horizon = _horizon(body, settings, manifest)
-    frames = horizon or manifest.horizon
-    _check_limits(body, settings, manifest, frames=frames)
-    if "quantiles" in body.returned:
-        check_levels(
-            body.quantile_levels,
-            num_samples=body.num_samples,
-            calibration=manifest.calibration,
-        )
-    request = trajectory.Request(
-        observation=(observation := await _observation(body, manifest)).positions,
-        num_samples=body.num_samples,
-        num_steps=body.num_steps,
-        seed=_seed(body),
-        deadline_s=_deadline_s(http, body, timeout_s),
-        tolerance_m=body.tolerance_m,
-        horizon=horizon,
-        previews=media_type in STREAMS,
-    )
-    answer = Answer(
-        id=visit_of(http).request_id,
+    plan, visit = planned(body, catalog=catalog, settings=settings), visit_of(http)
+    request, answer = await prepared(
+        body,
+        plan,
+        request_id=visit.request_id,
         media_type=media_type,
-        observation=observation,
-        manifest=manifest,
-        seed=request.seed,
-        bone_lengths=body.bone_lengths,
-        warnings=_rolled_out(frames, manifest),
-        returned=body.returned,
-        num_modes=body.num_modes,
-        levels=body.quantile_levels,
-        facts=visit_of(http).facts,
+        deadline_s=deadline_of(body, arrived_s=visit.arrived_s, timeout_s=timeout_s),
     )
-    return await _answered(http, worker, request, answer)
+    return await _answered(http, plan.worker, request, answer)
 
 
 @router.post(
@@ -191,11 +168,11 @@ async def predict_actions(
     request = trajectory.Request(
         observation=(observation := await _observation(body, manifest)).positions,
         num_samples=body.num_samples,
-        seed=_seed(body),
+        seed=seed_of(body),
         actions=indices,
         stop_threshold_m=body.stop_threshold,
         max_frames=longest,
-        deadline_s=_deadline_s(http, body, timeout_s),
+        deadline_s=deadline_of(body, arrived_s=visit_of(http).arrived_s, timeout_s=timeout_s),
     )
     answer = Answer(
         id=visit_of(http).request_id,
@@ -205,7 +182,6 @@ async def predict_actions(
         seed=request.seed,
         bone_lengths=body.bone_lengths,
         warnings=(),
-        facts=visit_of(http).facts,
     )
     return await _answered(http, worker, request, answer)
 
@@ -233,7 +209,75 @@ async def cancel(request_id: str, catalog: TheCatalog) -> None:
         )
 
 
-def _seed(body: schemas.ObservedMotion) -> int:
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Plan:
+    """Who answers a request, and with how many frames; None leaves that to the bundle."""
+
+    manifest: Manifest
+    worker: Worker
+    horizon: int | None
+
+
+def planned(body: schemas.PredictRequest, *, catalog: Catalog, settings: Settings) -> Plan:
+    """How a request will be answered.
+
+    Raises:
+        ServiceError: it cannot be, whatever its poses are.
+    """
+    manifest, worker = catalog.ready(body.model, with_actions=False)
+    horizon = _horizon(body, settings, manifest)
+    _check_limits(body, settings, manifest, frames=horizon or manifest.horizon)
+    if "quantiles" in body.returned:
+        check_levels(
+            body.quantile_levels, num_samples=body.num_samples, calibration=manifest.calibration
+        )
+    return Plan(manifest=manifest, worker=worker, horizon=horizon)
+
+
+async def prepared(
+    body: schemas.PredictRequest,
+    plan: Plan,
+    *,
+    request_id: str,
+    media_type: str,
+    deadline_s: float | None,
+    beside: Mapping[str, Any] | None = None,
+) -> tuple[trajectory.Request, Answer]:
+    """What the engine is asked, and what writes its answer.
+
+    Raises:
+        FieldError: the poses, or the skeleton that they are in, are not those of a person.
+    """
+    manifest, horizon = plan.manifest, plan.horizon
+    observation = await _observation(body, manifest)
+    request = trajectory.Request(
+        observation=observation.positions,
+        num_samples=body.num_samples,
+        num_steps=body.num_steps,
+        seed=seed_of(body),
+        deadline_s=deadline_s,
+        tolerance_m=body.tolerance_m,
+        horizon=horizon,
+        previews=media_type in STREAMS,
+    )
+    answer = Answer(
+        id=request_id,
+        media_type=media_type,
+        observation=observation,
+        manifest=manifest,
+        seed=request.seed,
+        bone_lengths=body.bone_lengths,
+        warnings=_rolled_out(horizon or manifest.horizon, manifest),
+        returned=body.returned,
+        num_modes=body.num_modes,
+        levels=body.quantile_levels,
+        beside=beside or {},
+    )
+    return request, answer
+
+
+def seed_of(body: schemas.ObservedMotion) -> int:
+    """The seed of a request; drawn where it has none."""
     return secrets.randbelow(schemas.MAX_SEED + 1) if body.seed is None else body.seed
 
 
@@ -241,7 +285,7 @@ async def _observation(body: schemas.ObservedMotion, manifest: Manifest) -> Obse
     def read() -> Observation:
         return read_observation(
             body.poses,
-            skeleton=_skeleton(body, manifest),
+            skeleton=skeleton_of(body, manifest),
             axes=Axes(up=body.axes.up, units=body.axes.units),
             fps=body.fps or manifest.fps,
             manifest=manifest,
@@ -250,14 +294,14 @@ async def _observation(body: schemas.ObservedMotion, manifest: Manifest) -> Obse
     return await asyncio.to_thread(read) if len(body.poses) > MANY_FRAMES else read()
 
 
-def _deadline_s(
-    http: Request, body: schemas.ObservedMotion, timeout_s: float | None
+def deadline_of(
+    body: schemas.ObservedMotion, *, arrived_s: float, timeout_s: float | None = None
 ) -> float | None:
     """The sooner of both deadlines, on the clock of ``perf_counter``, counted from the arrival."""
     seconds = [timeout_s] if timeout_s is not None else []
     if body.deadline_ms is not None:
         seconds.append(body.deadline_ms / 1000.0)
-    return visit_of(http).arrived_s + min(seconds) if seconds else None
+    return arrived_s + min(seconds) if seconds else None
 
 
 def _horizon(body: schemas.PredictRequest, settings: Settings, manifest: Manifest) -> int | None:
@@ -296,7 +340,9 @@ async def _answered(
             visit.status = CLIENT_GONE if visit.status == 200 else visit.status
             return
         record_stages(answer.stages_s)
-        visit.facts |= {f"{name}_ms": ms for name, ms in answer.milliseconds().items()}
+        visit.facts |= answer.facts | {
+            f"{name}_ms": ms for name, ms in answer.milliseconds().items()
+        }
         deadline_s = request.deadline_s
         metrics_of(http).answered(
             model=answer.manifest.name,
@@ -359,7 +405,8 @@ async def _streamed(
     )
 
 
-def _skeleton(body: schemas.ObservedMotion, manifest: Manifest) -> Skeleton | OwnJoints:
+def skeleton_of(body: schemas.ObservedMotion, manifest: Manifest) -> Skeleton | OwnJoints:
+    """What the poses are in; the bundle's skeleton where the request does not say."""
     if isinstance(body.skeleton, schemas.SkeletonBody):
         return body.skeleton.own_joints()
     if body.skeleton is None or body.skeleton == manifest.skeleton.name:

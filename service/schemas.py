@@ -15,6 +15,7 @@ from service.skeletons import OwnJoints
 MAX_SEED = 2**53 - 1  # the largest integer that every JSON reader keeps
 MAX_ACTIONS = 16
 MAX_STOP_THRESHOLD_M = 1.0
+MAX_STREAM_HZ = 60.0
 
 _POSES_SCHEMA = {
     "type": "array",
@@ -235,6 +236,29 @@ class PredictResponse(Answer):
     modes: list[Mode] | None = Field(default=None, description="the likeliest first")
     quantiles: Quantiles | None = None
     steps: Steps
+
+
+class StreamStart(_Body):
+    """The first message of WS /stream, and any later one that asks for something else."""
+
+    type: Literal["start"]
+    session: str | None = Field(
+        default=None, description="of a connection that was lost, whose frames are still there"
+    )
+    rate_hz: float = Field(
+        default=10.0, gt=0, le=MAX_STREAM_HZ, description="answers a second, at most"
+    )
+    options: dict[str, Any] = Field(
+        default={}, description="fields of POST /predict, without poses; a seed is drawn but once"
+    )
+
+
+class StreamFrame(_Body):
+    """A pose, and when it was seen."""
+
+    type: Literal["frame"]
+    t: float = Field(allow_inf_nan=False, description="seconds on any clock, later each time")
+    pose: list[Any] | InstanceOf[np.ndarray]
 
 
 class ActionSegment(_Body):
