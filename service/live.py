@@ -217,7 +217,7 @@ class _Connection:
         try:
             content = await self._predicted(session)
         except ServiceError as error:
-            self._complain(error)
+            self._complain(error, t=session.answered_s)
             return error.retry_after_s or 0.0
         self._facts["answers"] += 1
         await self._send(content)
@@ -242,9 +242,10 @@ class _Connection:
     def _planned(self, body: PredictRequest) -> Plan:
         return planned(body, catalog=self._state.catalog, settings=self._state.settings)
 
-    def _complain(self, error: ServiceError) -> None:
+    def _complain(self, error: ServiceError, *, t: float | None = None) -> None:
+        """Tell of an error, of the answer to the frames until ``t`` where it is one."""
         self._facts["problems"] += 1
-        told = content_of(error, status=error.status)
+        told = content_of(error, status=error.status) | ({} if t is None else {"t": t})
         self._unsent["error"] = {"type": "error", "problem": told}
 
     async def _send(self, content: bytes) -> None:

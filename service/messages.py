@@ -97,6 +97,14 @@ class Prediction(Answer):
     steps: Steps
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class LivePrediction:
+    """Futures of a stream, from its frame of second ``t`` on."""
+
+    t: float
+    prediction: Prediction
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ActionSegment:
     """The frames ``start`` to before ``end`` of a future, in which one action is performed.
@@ -154,17 +162,32 @@ def predict_actions(
 
 
 def _posted(path: str, fields: dict[str, Any], read: Callable[[dict[str, Any]], _T]) -> Call[_T]:
-    """A call whose seed is drawn here, so that however often it is sent, the answer is one."""
+    body = _body(fields)
+    request_id = body.pop("request_id", None)
+    return Call(method="POST", path=path, body=body, request_id=request_id, read=read)
+
+
+def _body(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields with a seed that is drawn here: however often they are sent, the answer is one."""
     body = {
         name: value.item() if isinstance(value, np.generic) else value
         for name, value in fields.items()
     }
-    request_id = body.pop("request_id", None)
     if "returned" in body:
         body["return"] = body.pop("returned")
     if body.get("seed") is None:
         body["seed"] = SystemRandom().randrange(MAX_SEED + 1)
-    return Call(method="POST", path=path, body=body, request_id=request_id, read=read)
+    return body
+
+
+def live_start(options: PredictOptions, *, rate_hz: float) -> dict[str, Any]:
+    """What a stream begins with."""
+    return {"type": "start", "session": None, "rate_hz": rate_hz, "options": _body(options)}
+
+
+def live_prediction(content: dict[str, Any]) -> LivePrediction:
+    """What a stream says of its latest frames."""
+    return LivePrediction(t=content["t"], prediction=_prediction(content["answer"]))
 
 
 def got(path: str) -> Call[dict[str, Any]]:
