@@ -19,7 +19,6 @@ from pydantic import BaseModel, ValidationError
 from starlette.types import Message
 from starlette.websockets import WebSocketDisconnect
 
-from service.axes import Axes
 from service.errors import (
     BodyTooLargeError,
     FieldError,
@@ -143,7 +142,7 @@ class _Connection:
             raise _at(error, f"/options{error.pointer}") from error
         watch = Watch(
             joints=tuple(joints),
-            axes=Axes(up=body.axes.up, units=body.axes.units),
+            axes=body.axes.axes(),
             fps=body.fps or manifest.fps,
             num_frames=frames_needed(manifest, body.fps or manifest.fps),
         )

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from service.modes import Mode
+from service.occupancy import Occupancy
 from service.quantiles import Regions
 from service.schemas import MAX_SEED
 
@@ -31,6 +32,7 @@ class Options(TypedDict, total=False):
     model: str | None
     bone_lengths: Literal["observed", "free"]
     deadline_ms: float | None
+    occupancy: Mapping[str, Any] | None
     request_id: str
 
 
@@ -40,7 +42,7 @@ class PredictOptions(Options, total=False):
     num_steps: int | None
     tolerance_m: float | None
     horizon_s: float | None
-    returned: Sequence[Literal["futures", "modes", "quantiles"]]
+    returned: Sequence[Literal["futures", "modes", "quantiles", "occupancy"]]
     num_modes: int
     quantile_levels: Sequence[float]
 
@@ -50,6 +52,7 @@ class ActionsOptions(Options, total=False):
 
     stop_threshold: float | None
     max_seconds_per_action: float | None
+    returned: Sequence[Literal["futures", "occupancy"]]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -72,7 +75,10 @@ class Preview:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Answer:
-    """What every answer says beside its futures; ``timing_ms`` of each stage is the server's."""
+    """What every answer says beside its futures; ``timing_ms`` of each stage is the server's.
+
+    ``occupancy`` is that of each region, where it was asked for, in the caller's units.
+    """
 
     id: str
     joints: tuple[str, ...]
@@ -80,6 +86,7 @@ class Answer:
     seed: int
     model: str
     warnings: tuple[str, ...]
+    occupancy: tuple[Occupancy, ...]
     timing_ms: Mapping[str, float]
 
 
@@ -218,8 +225,22 @@ def _regions(levels: Sequence[float], centre: Any, radius: Any, *, calibrated: b
     )
 
 
+def _occupancy(
+    probability: Any, num_lasting: Any, first_entry: dict[str, Any], min_distance: dict[str, Any]
+) -> Occupancy:
+    times = [inf if time_s is None else time_s for time_s in first_entry["time_s"]]
+    return Occupancy(
+        probability=np.array(probability),
+        num_lasting=np.array(num_lasting),
+        never=first_entry["never"],
+        levels=tuple(first_entry["levels"]),
+        first_entry_s=np.array(times),
+        min_distance=np.array(min_distance["distance"]),
+    )
+
+
 def _actions_prediction(content: dict[str, Any]) -> ActionsPrediction:
-    futures = content["futures"]
+    futures = content.get("futures", ())
     return ActionsPrediction(
         futures=tuple(np.array(future["poses"]) for future in futures),
         segments=tuple(
@@ -237,6 +258,7 @@ def _said(content: dict[str, Any]) -> dict[str, Any]:
         "seed": content["seed"],
         "model": content["model"]["name"],
         "warnings": tuple(content["warnings"]),
+        "occupancy": tuple(_occupancy(**region) for region in content.get("occupancy", ())),
         "timing_ms": content["timing_ms"],
     }
 

@@ -2,7 +2,7 @@
 
 import asyncio
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
 from time import perf_counter
@@ -16,7 +16,6 @@ from models.motion.skeleton import Skeleton
 from service import schemas
 from service.actions import action_indices, max_frames
 from service.answer import Answer
-from service.axes import Axes
 from service.body import BodyRoute
 from service.catalog import Catalog
 from service.delivery import Stream, event, unless_gone
@@ -41,6 +40,7 @@ from service.errors import (
 from service.futures import num_frames
 from service.media import DOCUMENTS, MSGPACK, NPZ, STREAMS, accepted
 from service.observation import Observation, read_observation
+from service.occupancy import Query
 from service.problems import declared
 from service.quantiles import check_levels
 from service.settings import Settings
@@ -161,6 +161,7 @@ async def predict_actions(
 ) -> Response:
     """N futures of the person in the poses, who performs the actions one after the other."""
     media_type = accepted(http.headers.get("accept", ""), DOCUMENTS)
+    _query(body, body.returned)
     manifest, worker = catalog.ready(body.model, with_actions=True)
     indices = action_indices(body.actions, manifest)
     longest = max_frames(body.max_seconds_per_action, manifest)
@@ -182,6 +183,8 @@ async def predict_actions(
         seed=request.seed,
         bone_lengths=body.bone_lengths,
         warnings=(),
+        returned=body.returned,
+        query=_query(body, body.returned),
     )
     return await _answered(http, worker, request, answer)
 
@@ -224,6 +227,7 @@ def planned(body: schemas.PredictRequest, *, catalog: Catalog, settings: Setting
     Raises:
         ServiceError: it cannot be, whatever its poses are.
     """
+    _query(body, body.returned)
     manifest, worker = catalog.ready(body.model, with_actions=False)
     horizon = _horizon(body, settings, manifest)
     _check_limits(body, settings, manifest, frames=horizon or manifest.horizon)
@@ -271,6 +275,7 @@ async def prepared(
         returned=body.returned,
         num_modes=body.num_modes,
         levels=body.quantile_levels,
+        query=_query(body, body.returned),
         beside=beside or {},
     )
     return request, answer
@@ -286,7 +291,7 @@ async def _observation(body: schemas.ObservedMotion, manifest: Manifest) -> Obse
         return read_observation(
             body.poses,
             skeleton=skeleton_of(body, manifest),
-            axes=Axes(up=body.axes.up, units=body.axes.units),
+            axes=body.axes.axes(),
             fps=body.fps or manifest.fps,
             manifest=manifest,
         )
@@ -412,6 +417,25 @@ def skeleton_of(body: schemas.ObservedMotion, manifest: Manifest) -> Skeleton | 
     if body.skeleton is None or body.skeleton == manifest.skeleton.name:
         return manifest.skeleton.skeleton()
     return standard_skeleton(body.skeleton)
+
+
+def _query(body: schemas.ObservedMotion, returned: Sequence[str]) -> Query | None:
+    """What is asked of regions, in metres, +Z up."""
+    if body.occupancy is None:
+        if "occupancy" not in returned:
+            return None
+        raise FieldError(
+            pointer="/occupancy",
+            found="nothing",
+            expected="its regions are required where return names occupancy",
+        )
+    if "occupancy" not in returned:
+        raise FieldError(
+            pointer="/return",
+            found=", ".join(returned),
+            expected="it must name occupancy where regions are given",
+        )
+    return body.occupancy.query(body.axes.axes())
 
 
 def _check_limits(

@@ -2,7 +2,7 @@ from asyncio import Event
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.axes import Axes
@@ -28,6 +28,7 @@ def filled(times: list[float]) -> History:
 spacings = st.lists(st.floats(1e-4, 0.9 * GAP_S), min_size=1, max_size=200)
 
 
+@settings(deadline=None)
 @given(spacings, st.floats(-100.0, 100.0))
 def test_even_motion_is_seen_evenly_however_uneven_its_frames_are(gaps: list[float], start: float):
     history = filled((start + np.cumsum(gaps)).tolist())
@@ -39,6 +40,7 @@ def test_even_motion_is_seen_evenly_however_uneven_its_frames_are(gaps: list[flo
     assert history.suffices == (len(poses) >= NUM_FRAMES)
 
 
+@settings(deadline=None)
 @given(spacings)
 def test_so_many_frames_are_kept_and_no_more(gaps: list[float]):
     history = filled(np.cumsum(gaps).tolist())
