@@ -7,13 +7,12 @@ opened again with the same session, whose frames the server still has for a whil
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncGenerator, Generator, Iterator
-from contextlib import ExitStack, aclosing, suppress
-from itertools import count
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from secrets import SystemRandom
 from time import monotonic
 from types import TracebackType
-from typing import Any, TypeAlias, cast
+from typing import Any
 
 import numpy as np
 import orjson
@@ -37,10 +36,8 @@ from service.messages import LivePrediction, PredictOptions
 
 KEPT_FRAMES = 256
 CLOSING_S = 1.0
+LONGEST_S = 5.0  # between two tries
 TAKEN = 4409  # why the server closes a connection: another one has its session
-
-
-_Sockets: TypeAlias = AsyncGenerator[ClientConnection, None]
 
 
 class AsyncLive:
@@ -129,35 +126,40 @@ class AsyncLive:
         self._news.clear()
 
     async def _run(self) -> None:
-        sockets = connect(
-            self._url,
-            additional_headers=self._headers,
-            compression=None,
-            max_size=None,
-            close_timeout=CLOSING_S,
-            process_exception=self._final,
-            reconnect_delays=_delays,
-        )
-        try:
-            async with aclosing(cast("_Sockets", aiter(sockets))) as opened:
-                async for socket in opened:
+        failures = 0
+        while True:
+            try:
+                async with connect(
+                    self._url,
+                    additional_headers=self._headers,
+                    compression=None,
+                    max_size=None,
+                    close_timeout=CLOSING_S,
+                ) as socket:
+                    failures = 0
                     with suppress(ConnectionClosed):
                         await self._talk(socket)
-                    if socket.close_code == TAKEN:
-                        raise ClientError("the stream: another connection resumed its session.")
-        except InvalidStatus as error:
-            problem = orjson.loads(error.response.body or b"{}")
-            raise problem_error(error.response.status_code, problem) from error
-        except (OSError, WebSocketException) as error:
+            except (OSError, WebSocketException) as error:
+                self._give_up(error)
+                failures += 1
+            else:
+                if socket.close_code == TAKEN:
+                    raise ClientError("the stream: another connection resumed its session.")
+            most_s = min(LONGEST_S, BACK_OFF_S * 2**failures)
+            await asyncio.sleep(SystemRandom().uniform(0.0, most_s))
+
+    def _give_up(self, error: Exception) -> None:
+        """Raise what is not worth another try; once a stream has begun, silence is."""
+        begun = self._start["session"] is not None
+        if isinstance(error, InvalidStatus):
+            status, content = error.response.status_code, error.response.body
+            if not begun or status not in (429, 503):
+                raise problem_error(status, orjson.loads(content or b"{}")) from error
+        elif not begun:
             raise ConnectionFailedError(
                 f"{self._url}: found no server that answers ({error}); start one with "
                 "`posefutures serve`."
             ) from error
-
-    def _final(self, error: Exception) -> Exception | None:
-        """The error if it is not worth another try; once a stream has begun, silence is."""
-        refused = isinstance(error, InvalidStatus) and error.response.status_code not in (429, 503)
-        return error if refused or not self._start["session"] else None
 
     async def _talk(self, socket: ClientConnection) -> None:
         await self._begin(socket)
@@ -251,8 +253,3 @@ async def _received(socket: ClientConnection) -> dict[str, Any]:
 
 def _error(message: dict[str, Any]) -> ProblemError:
     return problem_error(message["problem"]["status"], message["problem"])
-
-
-def _delays() -> Generator[float, None, None]:
-    for attempt in count():
-        yield SystemRandom().uniform(0.0, min(5.0, BACK_OFF_S * 2**attempt))

@@ -24,7 +24,7 @@ def live() -> Iterator[Live]:
 
 
 def ran(block: str, live: Live) -> dict[str, Any]:
-    """The names after a block has run on a server of ours, with deadlines that any machine keeps."""
+    """Its names after a block has run on our server, with deadlines that any machine keeps."""
     poses = np.array(orjson.loads((ROOT / "docs/observation.json").read_bytes())["poses"])
     code = block.replace("http://localhost:8000", live.url)
     code = re.sub(r"deadline_ms=\d+", "deadline_ms=60_000", code)
