@@ -30,6 +30,10 @@ class Region(ABC):
     def away(self, points: Points) -> Points:
         """From the nearest point of the core to each point; 0 within. Piecewise linear."""
 
+    def distances(self, points: Points) -> Float[np.ndarray, "*batch"]:
+        """Metres to each point; 0 within."""
+        return np.asarray(np.maximum(np.linalg.norm(self.away(points), axis=-1) - self.radius, 0.0))
+
     @abstractmethod
     def breaks(self, starts: Points, steps: Points) -> Float[np.ndarray, "*batch K"]:
         """For points that go from starts by steps in a time of 1, when ``away`` leaves a piece."""
@@ -162,10 +166,16 @@ def body_distances(
 ) -> Float[np.ndarray, "H"]:
     """Metres from the region to the nearest joint or bone of each pose; 0 where they meet.
 
-    A joint whose parent is -1 hangs on no bone.
+    A joint whose parent is -1 hangs on no bone. Of the bones only those are measured that may come
+    nearer than every joint: no point of one is nearer than its nearer end by half its length.
     """
     above = [joint if parent < 0 else parent for joint, parent in enumerate(parents)]
-    return np.asarray(segment_distances(poses[:, above], poses, region).min(axis=-1))
+    starts, apart = poses[:, above], region.distances(poses)
+    nearest = apart.min(axis=-1, keepdims=True)
+    half = np.linalg.norm(poses - starts, axis=-1) / 2
+    may_be = np.minimum(apart[:, above], apart) - half < nearest  # (H, J)
+    apart[may_be] = segment_distances(starts[may_be], poses[may_be], region)
+    return np.asarray(apart.min(axis=-1))
 
 
 def segment_distances(starts: Points, ends: Points, region: Region) -> Float[np.ndarray, "*batch"]:
@@ -187,8 +197,7 @@ def segment_distances(starts: Points, ends: Points, region: Region) -> Float[np.
     rises = np.maximum(np.take_along_axis(slopes, after, -1), 0.0)
     share = falls / np.where(falls > 0.0, falls + rises, 1.0)
     nearest = starts + (before_t + share * (after_t - before_t)) * steps
-    apart = np.linalg.norm(region.away(nearest), axis=-1) - region.radius
-    return np.asarray(np.maximum(apart, 0.0))
+    return region.distances(nearest)
 
 
 def _when(

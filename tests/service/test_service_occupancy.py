@@ -131,6 +131,20 @@ def test_a_body_is_as_near_as_its_nearest_bone_in_each_frame():
     np.testing.assert_allclose(apart, [1.25**0.5 - 0.1, 3.9])
 
 
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**32), regions)
+def test_a_body_is_as_near_as_the_nearest_of_all_its_bones(seed, region):
+    """The slow obvious way: every bone is measured."""
+    poses = np.random.default_rng(seed).normal(scale=2.0, size=(20, 6, 3))
+    parents = (-1, 0, 1, 2, -1, 4)
+    bones = [segment_distances(poses[:, parent if parent >= 0 else joint],
+                               poses[:, joint], region)
+             for joint, parent in enumerate(parents)]  # fmt: skip
+    np.testing.assert_allclose(
+        body_distances(poses, parents, region), np.min(bones, axis=0), atol=1e-9
+    )
+
+
 def test_entries_are_counted_and_their_times_ranked():
     far, at_once, late = [2.0] * 4, [0.1, 0.1, 0.1, 2.0], [2.0, 1.0, 0.2, 0.0]
     found = occupancy(
