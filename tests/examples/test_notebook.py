@@ -36,7 +36,7 @@ def test_notebook_runs_top_to_bottom(monkeypatch: pytest.MonkeyPatch):
     assert "(50, 60, 21, 3)" in printed
     assert "of the futures come too near" in printed
     assert "wave-both-hands" in printed
-    assert "after 0.47 s: (10, 60, 21, 3)" in printed
+    assert "after 0.57 s: (10, 60, 21, 3)" in printed
     pictures = [
         output
         for cell in notebook.cells

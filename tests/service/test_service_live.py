@@ -298,10 +298,10 @@ def test_one_prediction_is_under_way_however_fast_frames_come(bundles: Path):
     settings = {"max_samples": 1000, "max_poses": 10**6, "rows_per_step": 1, "workers": 1}
     with Live(bundles, **settings) as live:
         with connect(f"ws://127.0.0.1:{live.port}/stream", max_size=None) as socket:
-            options = OPTIONS | {"num_samples": 50}
+            options = OPTIONS | {"num_samples": 20}
             socket.send(orjson.dumps({"type": "start", "rate_hz": 60, "options": options}).decode())
             loads = set()
-            for t in range(300):
+            for t in range(150):
                 frame = {"type": "frame", "t": t / FPS, "pose": WALK[0]}
                 socket.send(dumped(frame).decode())
                 loads.add(live.under_way())
