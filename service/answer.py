@@ -1,7 +1,8 @@
 """The answer to a prediction as bytes, written from arrays without a detour."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from time import perf_counter
 from typing import Any
 
@@ -16,6 +17,7 @@ from service.futures import DECIMALS, BoneLengths, caller_futures, caller_segmen
 from service.media import MOTIONS, encoded
 from service.modes import modes
 from service.observation import Observation
+from service.occupancy import Query
 from service.quantiles import regions
 from service.worker import Timing
 
@@ -27,7 +29,7 @@ class Answer:
     """Writes the answers to one request, in the worker's thread; then there are ``stages_s``.
 
     Numbers are rounded to 0.1 mm. Equal requests of equal ids have equal bytes up to ``timing_ms``,
-    which comes last.
+    which comes last. Where something goes ``beside`` it, the answer is under ``answer``.
     """
 
     id: str
@@ -40,6 +42,8 @@ class Answer:
     returned: Sequence[str] = ("futures",)
     num_modes: int = 1
     levels: Sequence[float] = ()
+    query: Query | None = None
+    beside: Mapping[str, Any] = field(default_factory=dict)
     stages_s: dict[str, float] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
     motions: Sequence[Float[np.ndarray, "_ J 3"]] = ()
@@ -80,7 +84,8 @@ class Answer:
             self.about = {key: told for key, told in content.items() if key not in _IN_FILES}
             body = b""
         else:
-            body = encoded(content, self.media_type)
+            message = {**self.beside, "answer": content} if self.beside else content
+            body = encoded(message, self.media_type)
         self.stages_s["answer"] = perf_counter() - started_s
         self.facts |= {
             "steps_run": result.steps_run,
@@ -143,6 +148,7 @@ class Answer:
             ]
         if "quantiles" in self.returned:
             content["quantiles"] = self._quantiles(in_world)
+        content |= self._occupancy(list(in_world))
         steps = {"run": result.steps_run, "of": result.steps_of, "stopped_by": result.stopped_by}
         return content | {"steps": steps}
 
@@ -163,17 +169,46 @@ class Answer:
             "calibrated": found.calibrated,
         }
 
+    def _occupancy(self, in_world: Sequence[Float[np.ndarray, "_ J 3"]]) -> dict[str, Any]:
+        if self.query is None:
+            return {}
+        caller = self.observation.caller
+        units = UNITS_PER_METRE[caller.axes.units]
+        decimals = DECIMALS - round(np.log10(units))
+        return {
+            "occupancy": [
+                {
+                    "probability": found.probability.astype(np.float32),
+                    "num_lasting": found.num_lasting.tolist(),
+                    "first_entry": {
+                        "never": found.never,
+                        "levels": list(found.levels),
+                        "time_s": [
+                            round(t, 4) if t < inf else None for t in found.first_entry_s.tolist()
+                        ],
+                    },
+                    "min_distance": {
+                        "levels": list(found.levels),
+                        "distance": np.round(found.min_distance * units, decimals).tolist(),
+                    },
+                }
+                for found in self.query.of(in_world, caller)
+            ]
+        }
+
     def _performed(
         self, in_world: Float[np.ndarray, "N H J 3"], segments: Sequence[Sequence[Segment]]
     ) -> dict[str, Any]:
         """Each future as long as its actions took, and the frames of each action in it."""
+        caller = self.observation.caller
         labels = self.manifest.actions.labels if self.manifest.actions else ()
-        futures = written(in_world, self.observation.caller)
-        return {
-            "futures": [
+        ends = [parts[-1].end for parts in segments]
+        content: dict[str, Any] = {}
+        if "futures" in self.returned:
+            content["futures"] = [
                 {
-                    "num_frames": parts[-1].end,
-                    "poses": np.ascontiguousarray(future[: parts[-1].end]),
+                    "num_frames": end,
+                    "poses": np.ascontiguousarray(future[:end]),
                     "segments": [
                         {
                             "action": labels[part.action],
@@ -184,6 +219,9 @@ class Answer:
                         for part in parts
                     ],
                 }
-                for future, parts in zip(futures, segments, strict=True)
+                for future, parts, end in zip(
+                    written(in_world, caller), segments, ends, strict=True
+                )
             ]
-        }
+        lasting = [future[:end] for future, end in zip(in_world, ends, strict=True)]
+        return content | self._occupancy(lasting)

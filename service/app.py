@@ -10,13 +10,14 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from service import files, predictions, validation
+from service import files, live, predictions, validation
 from service.catalog import Catalog
 from service.guard import Guard
 from service.metrics import Metrics
 from service.page import add_page
 from service.problems import add_problem_responses
 from service.routes import health, router
+from service.sessions import Sessions
 from service.settings import Settings
 from service.telemetry import telemetry_config
 from service.visits import Visits
@@ -71,9 +72,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.metrics = metrics
     app.state.draining = False
     app.state.streams = set()
+    app.state.sessions = Sessions(most=settings.max_streams)
     app.include_router(predictions.router)
     app.include_router(files.router)
     app.include_router(validation.router)
+    app.include_router(live.router)
     app.include_router(router)
     app.include_router(health)
     add_page(app, pose_landmarker=settings.pose_landmarker)

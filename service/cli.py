@@ -1,9 +1,9 @@
-"""The command line ``posefutures``: serve, predict, convert, models, actions."""
+"""The command line ``posefutures``: serve, predict, stream, convert, models, actions."""
 
 import asyncio
 import socket
 from collections.abc import AsyncIterator, Iterator, Sequence
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -27,7 +27,8 @@ from service.client import AsyncClient
 from service.errors import FieldError, ServiceError
 from service.exchange import ClientError
 from service.messages import ActionsOptions, ActionsPrediction, Prediction, PredictOptions, Preview
-from service.schemas import MAX_SEED, MAX_STOP_THRESHOLD_M
+from service.replay import recorded, replayed, told
+from service.schemas import MAX_SEED, MAX_STOP_THRESHOLD_M, MAX_STREAM_HZ
 from service.settings import Settings
 from service.skeletons import standard_skeleton
 
@@ -141,13 +142,7 @@ def predict(
             seed=seed,
         )
         options.pop("stream", None)
-        options |= {
-            "fps": motion.fps,
-            "skeleton": {
-                "joints": list(motion.skeleton.joints),
-                "parents": list(motion.skeleton.parents),
-            },
-        }
+        options |= {"fps": motion.fps, "skeleton": _skeleton(motion)}
         answer = asyncio.run(_answered(seen, labels, options, url=url, stream=stream))
         out.mkdir(parents=True, exist_ok=True)
         for warning in answer.warnings:
@@ -186,6 +181,47 @@ def convert(
         )
 
 
+@app.command()
+def stream(
+    file: Annotated[Path, typer.Argument(help=_READ)],
+    rate_hz: Annotated[
+        float, typer.Option(min=0.1, max=MAX_STREAM_HZ, help="answers a second, at most")
+    ] = 10.0,
+    num_samples: Annotated[int, typer.Option(min=1, help="how many futures")] = 10,
+    deadline_ms: Annotated[
+        float | None, typer.Option(help="answer by then with what is ready")
+    ] = None,
+    model: Annotated[str | None, typer.Option(help="a bundle's name")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=MAX_SEED)] = None,
+    speed: Annotated[float, typer.Option(min=0.01, help="1 is real time")] = 1.0,
+    out: Annotated[Path | None, typer.Option(help="file for the answers, one JSON a line")] = None,
+    url: Annotated[
+        str | None,
+        typer.Option(help="a server, such as http://127.0.0.1:8000; one of its own else"),
+    ] = None,
+) -> None:
+    """Replay the motion in a file as a live stream, and tell of each answer."""
+    with _one_line_errors(), nullcontext() if out is None else out.open("wb") as records:
+        motion = read_motion(file)
+        options: PredictOptions = {
+            "num_samples": num_samples,
+            "deadline_ms": deadline_ms,
+            "model": model,
+            "seed": seed,
+            "fps": motion.fps,
+            "skeleton": _skeleton(motion),
+        }
+
+        async def replay() -> None:
+            async with _client(url) as client, client.live(rate_hz=rate_hz, **options) as live:
+                async for answer in replayed(motion, live, speed=speed):
+                    typer.echo(told(answer))
+                    if records is not None:
+                        records.write(recorded(answer))
+
+        asyncio.run(replay())
+
+
 def _tell(answer: Prediction) -> None:
     """What of an answer is no file: where it stopped early, and which futures stand for all."""
     steps = answer.steps
@@ -214,6 +250,12 @@ def _options(*, performs: bool, **asked: Any) -> dict[str, Any]:
     return options
 
 
+def _skeleton(motion: Motion) -> dict[str, Any]:
+    """The skeleton of a file as a request describes it."""
+    skeleton = motion.skeleton
+    return {"joints": list(skeleton.joints), "parents": list(skeleton.parents)}
+
+
 def _catalog() -> Catalog:
     catalog: Catalog = create_app(Settings()).state.catalog
     return catalog
@@ -227,12 +269,7 @@ async def _answered(
     url: str | None,
     stream: bool,
 ) -> Prediction | ActionsPrediction:
-    settings = Settings()
-    keys = [key.get_secret_value() for key in settings.api_keys]
-    async with (
-        _server(url, settings) as address,
-        AsyncClient(address, api_key=keys[0] if keys else None) as client,
-    ):
+    async with _client(url) as client:
         if labels is not None:
             return await client.predict_actions(seen.positions, labels, **options)
         if not stream:
@@ -252,6 +289,18 @@ async def _streamed(
             typer.echo(f"step {event.run} of {event.of}: {moved:.3f} m moved", err=True)
         before = event.futures
     return prediction
+
+
+@asynccontextmanager
+async def _client(url: str | None) -> AsyncIterator[AsyncClient]:
+    """A client of the server at ``url``, or of one that lives as long as the context."""
+    settings = Settings()
+    keys = [key.get_secret_value() for key in settings.api_keys]
+    async with (
+        _server(url, settings) as address,
+        AsyncClient(address, api_key=keys[0] if keys else None) as client,
+    ):
+        yield client
 
 
 @asynccontextmanager

@@ -4,6 +4,7 @@ The errors that they raise are a tree, drawn in `service.exchange`.
 """
 
 from collections.abc import AsyncGenerator, Iterator, Sequence
+from functools import partial
 from types import TracebackType
 from typing import Any, Unpack
 
@@ -13,6 +14,7 @@ from jaxtyping import Float
 
 from service import messages
 from service.exchange import Exchange, each_now, key, now
+from service.live_client import AsyncLive, Live
 from service.messages import (
     ActionsOptions,
     ActionsPrediction,
@@ -41,6 +43,7 @@ class AsyncClient:
         api_key: str | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
+        self._live = partial(AsyncLive, base_url, api_key=api_key)
         http = httpx.AsyncClient(base_url=base_url, headers=key(api_key), transport=transport)
         self._exchange = Exchange(http, timeout_s=timeout_s, attempts=attempts)
 
@@ -93,6 +96,10 @@ class AsyncClient:
         """
         return self._exchange.events(messages.predict(poses, options))
 
+    def live(self, *, rate_hz: float = 10.0, **options: Unpack[PredictOptions]) -> AsyncLive:
+        """Futures of poses as they come; an async context manager, which is iterated."""
+        return self._live(rate_hz=rate_hz, options=options)
+
     async def cancel(self, request_id: str) -> bool:
         """Free the rows of a request; false where nothing of this ``request_id`` is under way."""
         return await self._exchange.cancelled(request_id)
@@ -118,6 +125,7 @@ class Client:
         api_key: str | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
+        self._live = partial(Live, base_url, api_key=api_key)
         http = httpx.Client(base_url=base_url, headers=key(api_key), transport=transport)
         self._exchange = Exchange(http, timeout_s=timeout_s, attempts=attempts)
 
@@ -156,6 +164,10 @@ class Client:
     ) -> Iterator[Preview | Prediction]:
         """`AsyncClient.stream`."""
         return each_now(self._exchange.events(messages.predict(poses, options)))
+
+    def live(self, *, rate_hz: float = 10.0, **options: Unpack[PredictOptions]) -> Live:
+        """Futures of poses as they come; a context manager, which is iterated."""
+        return self._live(rate_hz=rate_hz, options=options)
 
     def cancel(self, request_id: str) -> bool:
         """`AsyncClient.cancel`."""

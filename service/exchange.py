@@ -163,7 +163,7 @@ class Exchange:
                 if name == "preview":
                     yield messages.preview(content)
                 elif name == "error":
-                    raise _problem(content["status"], content)
+                    raise problem_error(content["status"], content)
                 elif name == "end":
                     yield call.read(told["final"])
                     return
@@ -253,10 +253,13 @@ def _failure(response: httpx.Response) -> ProblemError:
     status, retry_after = response.status_code, response.headers.get("retry-after", "")
     told = response.headers.get("content-type") == "application/problem+json"
     problem = orjson.loads(response.content) if told else {}
-    return _problem(status, problem, retry_after_s=_seconds(retry_after))
+    return problem_error(status, problem, retry_after_s=_seconds(retry_after))
 
 
-def _problem(status: int, problem: dict[str, Any], *, retry_after_s: float = 0.0) -> ProblemError:
+def problem_error(
+    status: int, problem: dict[str, Any], *, retry_after_s: float = 0.0
+) -> ProblemError:
+    """The error that a problem is to the client."""
     if status in (429, 503):
         return BusyError(status, problem, retry_after_s=retry_after_s)
     return (ServerFailedError if status >= 500 else BadRequestError)(status, problem)

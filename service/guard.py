@@ -1,7 +1,9 @@
 """Who may ask, how often, and how many at a time, before anything is read of a request."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from functools import partial
 from hashlib import sha256
 from hmac import compare_digest
 
@@ -23,7 +25,8 @@ class Guard:
 
     A rate, such as ``60/minute``, is that of a key, else of an address; it counts what computes, as
     does ``max_requests``, the most that may be under way. To refuse must cost next to nothing: at
-    ten times the load that a server can bear it is most of what it does.
+    ten times the load that a server can bear it is most of what it does. What computes within a
+    WebSocket asks ``state.admitted``.
     """
 
     def __init__(
@@ -52,15 +55,27 @@ class Guard:
                 if computes:
                     self._check_room()
                     await self._count(caller)
+                elif scope["type"] == "websocket":
+                    scope["state"]["admitted"] = partial(self._admitted, caller)
             except ServiceError as error:
                 app, computes = problem(error), False
-                if scope["type"] == "http":
-                    scope["state"]["visit"].failed(error)
+                scope["state"]["visit"].failed(error)
         self._num_requests += computes
         try:
             await app(scope, receive, send)
         finally:
             self._num_requests -= computes
+
+    @asynccontextmanager
+    async def _admitted(self, caller: str) -> AsyncIterator[None]:
+        """One thing that a connection lets compute, which counts as a request does."""
+        self._check_room()
+        await self._count(caller)
+        self._num_requests += 1
+        try:
+            yield
+        finally:
+            self._num_requests -= 1
 
     def _caller(self, scope: Scope) -> str:
         scheme, _, key = Headers(scope=scope).get("authorization", "").partition(" ")

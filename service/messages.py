@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from service.modes import Mode
+from service.occupancy import Occupancy
 from service.quantiles import Regions
 from service.schemas import MAX_SEED
 
@@ -33,6 +34,7 @@ class Options(TypedDict, total=False):
     model: str | None
     bone_lengths: Literal["observed", "free"]
     deadline_ms: float | None
+    occupancy: Mapping[str, Any] | None
     request_id: str
 
 
@@ -42,7 +44,7 @@ class PredictOptions(Options, total=False):
     num_steps: int | None
     tolerance_m: float | None
     horizon_s: float | None
-    returned: Sequence[Literal["futures", "modes", "quantiles"]]
+    returned: Sequence[Literal["futures", "modes", "quantiles", "occupancy"]]
     num_modes: int
     quantile_levels: Sequence[float]
 
@@ -52,6 +54,7 @@ class ActionsOptions(Options, total=False):
 
     stop_threshold: float | None
     max_seconds_per_action: float | None
+    returned: Sequence[Literal["futures", "occupancy"]]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -76,7 +79,8 @@ class Preview:
 class Answer:
     """What every answer says beside its futures; ``timing_ms`` of each stage is the server's.
 
-    ``joint_sources`` says of each joint whether it was observed, derived or imputed.
+    ``joint_sources`` says of each joint whether it was observed, derived or imputed;
+    ``occupancy`` is that of each region, where it was asked for, in the caller's units.
     """
 
     id: str
@@ -86,6 +90,7 @@ class Answer:
     seed: int
     model: str
     warnings: tuple[str, ...]
+    occupancy: tuple[Occupancy, ...]
     timing_ms: Mapping[str, float]
 
 
@@ -101,6 +106,14 @@ class Prediction(Answer):
     modes: tuple[Mode, ...]
     quantiles: Regions | None
     steps: Steps
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class LivePrediction:
+    """Futures of a stream, from its frame of second ``t`` on."""
+
+    t: float
+    prediction: Prediction
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -160,17 +173,32 @@ def predict_actions(
 
 
 def _posted(path: str, fields: dict[str, Any], read: Callable[[dict[str, Any]], _T]) -> Call[_T]:
-    """A call whose seed is drawn here, so that however often it is sent, the answer is one."""
+    body = _body(fields)
+    request_id = body.pop("request_id", None)
+    return Call(method="POST", path=path, body=body, request_id=request_id, read=read)
+
+
+def _body(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields with a seed that is drawn here: however often they are sent, the answer is one."""
     body = {
         name: value.item() if isinstance(value, np.generic) else value
         for name, value in fields.items()
     }
-    request_id = body.pop("request_id", None)
     if "returned" in body:
         body["return"] = body.pop("returned")
     if body.get("seed") is None:
         body["seed"] = SystemRandom().randrange(MAX_SEED + 1)
-    return Call(method="POST", path=path, body=body, request_id=request_id, read=read)
+    return body
+
+
+def live_start(options: PredictOptions, *, rate_hz: float) -> dict[str, Any]:
+    """What a stream begins with."""
+    return {"type": "start", "session": None, "rate_hz": rate_hz, "options": _body(options)}
+
+
+def live_prediction(content: dict[str, Any]) -> LivePrediction:
+    """What a stream says of its latest frames."""
+    return LivePrediction(t=content["t"], prediction=_prediction(content["answer"]))
 
 
 def got(path: str) -> Call[dict[str, Any]]:
@@ -201,8 +229,22 @@ def _regions(levels: Sequence[float], centre: Any, radius: Any, *, calibrated: b
     )
 
 
+def _occupancy(
+    probability: Any, num_lasting: Any, first_entry: dict[str, Any], min_distance: dict[str, Any]
+) -> Occupancy:
+    times = [inf if time_s is None else time_s for time_s in first_entry["time_s"]]
+    return Occupancy(
+        probability=np.array(probability),
+        num_lasting=np.array(num_lasting),
+        never=first_entry["never"],
+        levels=tuple(first_entry["levels"]),
+        first_entry_s=np.array(times),
+        min_distance=np.array(min_distance["distance"]),
+    )
+
+
 def _actions_prediction(content: dict[str, Any]) -> ActionsPrediction:
-    futures = content["futures"]
+    futures = content.get("futures", ())
     return ActionsPrediction(
         futures=tuple(np.array(future["poses"]) for future in futures),
         segments=tuple(
@@ -221,6 +263,7 @@ def _said(content: dict[str, Any]) -> dict[str, Any]:
         "seed": content["seed"],
         "model": content["model"]["name"],
         "warnings": tuple(content["warnings"]),
+        "occupancy": tuple(_occupancy(**region) for region in content.get("occupancy", ())),
         "timing_ms": content["timing_ms"],
     }
 

@@ -2,7 +2,8 @@
 
 import asyncio
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from math import ceil
 from time import perf_counter
 from typing import Annotated, Any
@@ -15,6 +16,7 @@ from service import schemas
 from service.actions import action_indices, max_frames
 from service.answer import Answer
 from service.body import BodyRoute
+from service.catalog import Catalog
 from service.delivery import Stream, event, unless_gone
 from service.dependencies import TheCatalog, TheSettings, metrics_of, settings_of, visit_of
 from service.engine import trajectory
@@ -37,6 +39,7 @@ from service.errors import (
 from service.futures import num_frames
 from service.media import BVH, DOCUMENTS, GLB, MOTIONS, MSGPACK, NPZ, STREAMS, ZIP, accepted
 from service.observation import Observation, read_observation
+from service.occupancy import Query
 from service.problems import declared
 from service.quantiles import check_levels
 from service.settings import Settings
@@ -128,43 +131,16 @@ async def predict(
 ) -> Response:
     """N futures of the person in the poses, in the caller's world, skeleton and frame rate."""
     media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *STREAMS, *MOTIONS))
-    manifest, worker = catalog.ready(body.model, with_actions=False)
-    horizon = _horizon(body, settings, manifest)
-    frames = horizon or manifest.horizon
-    _check_limits(body, settings)
-    _check_returned(body, media_type)
-    observation = await _observation(body, manifest)
-    _check_answer(body, settings, manifest, frames=frames, fps=observation.caller.fps)
-    if "quantiles" in body.returned:
-        check_levels(
-            body.quantile_levels,
-            num_samples=body.num_samples,
-            calibration=manifest.calibration,
-        )
-    request = trajectory.Request(
-        observation=observation.positions,
-        num_samples=body.num_samples,
-        num_steps=body.num_steps,
-        seed=_seed(body),
-        deadline_s=_deadline_s(http, body, timeout_s),
-        tolerance_m=body.tolerance_m,
-        horizon=horizon,
-        previews=media_type in STREAMS,
-    )
-    answer = Answer(
-        id=visit_of(http).request_id,
+    _check_returned(body.returned, media_type)
+    plan, visit = planned(body, catalog=catalog, settings=settings), visit_of(http)
+    request, answer = await prepared(
+        body,
+        plan,
+        request_id=visit.request_id,
         media_type=media_type,
-        observation=observation,
-        manifest=manifest,
-        seed=request.seed,
-        bone_lengths=body.bone_lengths,
-        warnings=_rolled_out(frames, manifest),
-        returned=body.returned,
-        num_modes=body.num_modes,
-        levels=body.quantile_levels,
-        facts=visit_of(http).facts,
+        deadline_s=deadline_of(body, arrived_s=visit.arrived_s, timeout_s=timeout_s),
     )
-    return await _answered(http, worker, request, answer)
+    return await _answered(http, plan.worker, request, answer)
 
 
 @router.post(
@@ -190,21 +166,23 @@ async def predict_actions(
 ) -> Response:
     """N futures of the person in the poses, who performs the actions one after the other."""
     media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *MOTIONS))
+    _check_returned(body.returned, media_type)
+    _query(body, body.returned)
     manifest, worker = catalog.ready(body.model, with_actions=True)
     indices = action_indices(body.actions, manifest)
     longest = max_frames(body.max_seconds_per_action, manifest)
     _check_limits(body, settings)
     observation = await _observation(body, manifest)
     most = len(indices) * (longest or manifest.horizon)
-    _check_answer(body, settings, manifest, frames=most, fps=observation.caller.fps)
+    _check_answer(body, settings.max_poses, manifest, frames=most, fps=observation.caller.fps)
     request = trajectory.Request(
         observation=observation.positions,
         num_samples=body.num_samples,
-        seed=_seed(body),
+        seed=seed_of(body),
         actions=indices,
         stop_threshold_m=body.stop_threshold,
         max_frames=longest,
-        deadline_s=_deadline_s(http, body, timeout_s),
+        deadline_s=deadline_of(body, arrived_s=visit_of(http).arrived_s, timeout_s=timeout_s),
     )
     answer = Answer(
         id=visit_of(http).request_id,
@@ -214,7 +192,8 @@ async def predict_actions(
         seed=request.seed,
         bone_lengths=body.bone_lengths,
         warnings=(),
-        facts=visit_of(http).facts,
+        returned=body.returned,
+        query=_query(body, body.returned),
     )
     return await _answered(http, worker, request, answer)
 
@@ -242,7 +221,80 @@ async def cancel(request_id: str, catalog: TheCatalog) -> None:
         )
 
 
-def _seed(body: schemas.ObservedMotion) -> int:
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Plan:
+    """Who answers a request, with how many frames (None leaves that to the bundle) and poses."""
+
+    manifest: Manifest
+    worker: Worker
+    horizon: int | None
+    most_poses: int
+
+
+def planned(body: schemas.PredictRequest, *, catalog: Catalog, settings: Settings) -> Plan:
+    """How a request will be answered.
+
+    Raises:
+        ServiceError: it cannot be, whatever its poses are.
+    """
+    _query(body, body.returned)
+    manifest, worker = catalog.ready(body.model, with_actions=False)
+    horizon = _horizon(body, settings, manifest)
+    _check_limits(body, settings)
+    if "quantiles" in body.returned:
+        check_levels(
+            body.quantile_levels, num_samples=body.num_samples, calibration=manifest.calibration
+        )
+    return Plan(manifest=manifest, worker=worker, horizon=horizon, most_poses=settings.max_poses)
+
+
+async def prepared(
+    body: schemas.PredictRequest,
+    plan: Plan,
+    *,
+    request_id: str,
+    media_type: str,
+    deadline_s: float | None,
+    beside: Mapping[str, Any] | None = None,
+) -> tuple[trajectory.Request, Answer]:
+    """What the engine is asked, and what writes its answer.
+
+    Raises:
+        FieldError: the poses, or the skeleton that they are in, are not those of a person.
+    """
+    manifest, horizon = plan.manifest, plan.horizon
+    frames = horizon or manifest.horizon
+    observation = await _observation(body, manifest)
+    _check_answer(body, plan.most_poses, manifest, frames=frames, fps=observation.caller.fps)
+    request = trajectory.Request(
+        observation=observation.positions,
+        num_samples=body.num_samples,
+        num_steps=body.num_steps,
+        seed=seed_of(body),
+        deadline_s=deadline_s,
+        tolerance_m=body.tolerance_m,
+        horizon=horizon,
+        previews=media_type in STREAMS,
+    )
+    answer = Answer(
+        id=request_id,
+        media_type=media_type,
+        observation=observation,
+        manifest=manifest,
+        seed=request.seed,
+        bone_lengths=body.bone_lengths,
+        warnings=_rolled_out(frames, manifest),
+        returned=body.returned,
+        num_modes=body.num_modes,
+        levels=body.quantile_levels,
+        query=_query(body, body.returned),
+        beside=beside or {},
+    )
+    return request, answer
+
+
+def seed_of(body: schemas.ObservedMotion) -> int:
+    """The seed of a request; drawn where it has none."""
     return secrets.randbelow(schemas.MAX_SEED + 1) if body.seed is None else body.seed
 
 
@@ -261,14 +313,14 @@ async def _observation(body: schemas.ObservedMotion, manifest: Manifest) -> Obse
     return await asyncio.to_thread(read) if len(body.poses) > MANY_FRAMES else read()
 
 
-def _deadline_s(
-    http: Request, body: schemas.ObservedMotion, timeout_s: float | None
+def deadline_of(
+    body: schemas.ObservedMotion, *, arrived_s: float, timeout_s: float | None = None
 ) -> float | None:
     """The sooner of both deadlines, on the clock of ``perf_counter``, counted from the arrival."""
     seconds = [timeout_s] if timeout_s is not None else []
     if body.deadline_ms is not None:
         seconds.append(body.deadline_ms / 1000.0)
-    return visit_of(http).arrived_s + min(seconds) if seconds else None
+    return arrived_s + min(seconds) if seconds else None
 
 
 def _horizon(body: schemas.PredictRequest, settings: Settings, manifest: Manifest) -> int | None:
@@ -307,7 +359,9 @@ async def _answered(
             visit.status = CLIENT_GONE if visit.status == 200 else visit.status
             return
         record_stages(answer.stages_s)
-        visit.facts |= {f"{name}_ms": ms for name, ms in answer.milliseconds().items()}
+        visit.facts |= answer.facts | {
+            f"{name}_ms": ms for name, ms in answer.milliseconds().items()
+        }
         deadline_s = request.deadline_s
         metrics_of(http).answered(
             model=answer.manifest.name,
@@ -373,6 +427,25 @@ async def _streamed(
     )
 
 
+def _query(body: schemas.ObservedMotion, returned: Sequence[str]) -> Query | None:
+    """What is asked of regions, in metres, +Z up."""
+    if body.occupancy is None:
+        if "occupancy" not in returned:
+            return None
+        raise FieldError(
+            pointer="/occupancy",
+            found="nothing",
+            expected="its regions are required where return names occupancy",
+        )
+    if "occupancy" not in returned:
+        raise FieldError(
+            pointer="/return",
+            found=", ".join(returned),
+            expected="it must name occupancy where regions are given",
+        )
+    return body.occupancy.query(body.axes.axes())
+
+
 def _check_limits(body: schemas.ObservedMotion, settings: Settings) -> None:
     if body.num_samples > settings.max_samples:
         raise FieldError(
@@ -388,29 +461,24 @@ def _check_limits(body: schemas.ObservedMotion, settings: Settings) -> None:
         )
 
 
-def _check_returned(body: schemas.PredictRequest, media_type: str) -> None:
-    if media_type in MOTIONS and "futures" not in body.returned:
+def _check_returned(returned: Sequence[str], media_type: str) -> None:
+    if media_type in MOTIONS and "futures" not in returned:
         raise FieldError(
             pointer="/return",
-            found=", ".join(body.returned),
+            found=", ".join(returned),
             expected=f"{media_type} holds futures, so they must be among what is returned",
         )
 
 
 def _check_answer(
-    body: schemas.ObservedMotion,
-    settings: Settings,
-    manifest: Manifest,
-    *,
-    frames: int,
-    fps: float,
+    body: schemas.ObservedMotion, most_poses: int, manifest: Manifest, *, frames: int, fps: float
 ) -> None:
     """The engine holds ``frames`` a future, at the bundle's rate; the answer, at the caller's."""
     longest = max(frames, num_frames(frames, manifest=manifest, fps=fps))
-    if body.num_samples * longest > settings.max_poses:
+    if body.num_samples * longest > most_poses:
         raise FieldError(
             pointer="/num_samples",
             found=f"{body.num_samples} futures of up to {longest} frames",
-            expected=f"this server answers with at most {settings.max_poses} poses; ask for fewer "
+            expected=f"this server answers with at most {most_poses} poses; ask for fewer "
             "samples or actions, or for less time or a lower rate",
         )

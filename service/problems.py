@@ -1,5 +1,6 @@
 """Errors as problem+json (RFC 9457), wherever in the application they come from."""
 
+from collections.abc import Sequence
 from itertools import groupby
 from math import ceil
 from operator import attrgetter
@@ -82,9 +83,7 @@ async def _on_service_error(request: Request, error: Exception) -> Response:
 async def _on_validation_error(_: Request, error: Exception) -> Response:
     if not isinstance(error, RequestValidationError):
         raise error
-    # The deepest of several complaints is about the variant that the caller meant.
-    first = max(error.errors(), key=lambda e: len(e["loc"]))
-    return problem(_field_error(first, error.body))
+    return problem(field_error(error.errors(), error.body))
 
 
 async def _on_http_exception(request: Request, error: Exception) -> Response:
@@ -114,8 +113,11 @@ async def _on_exception(request: Request, _: Exception) -> Response:
     return response
 
 
-def _field_error(error: dict[str, Any], body: object) -> FieldError:
-    if error["loc"][0] != "body":
+def field_error(errors: Sequence[Any], body: object) -> FieldError:
+    """What pydantic says of the fields of a request, or of its body alone."""
+    # The deepest of several complaints is about the variant that the caller meant.
+    error = max(errors, key=lambda e: len(e["loc"]))
+    if error["loc"][0] in ("header", "path", "query"):
         body = {error["loc"][0]: {error["loc"][1]: error["input"]}}
     parts, at_fault = _path(error["loc"], body)
     pointer = "".join(f"/{str(part).replace('~', '~0').replace('/', '~1')}" for part in parts)
@@ -133,8 +135,9 @@ def _field_error(error: dict[str, Any], body: object) -> FieldError:
 def _path(loc: tuple[int | str, ...], body: object) -> tuple[list[int | str], object]:
     """The part of an error's location that exists in the body; tags of unions do not."""
     parts: list[int | str] = []
-    for i, part in enumerate(loc[1:] if loc[:1] == ("body",) else loc):
-        last = i == len(loc) - 2
+    loc = loc[1:] if loc[:1] == ("body",) else loc
+    for i, part in enumerate(loc):
+        last = i == len(loc) - 1
         if isinstance(body, dict) and (part in body or last):
             parts.append(part)
             body = body.get(part)

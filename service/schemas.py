@@ -3,9 +3,20 @@
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, InstanceOf, Tag, WithJsonSchema
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    InstanceOf,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
-from models.motion.axes import Axes, Handed, Units, Up
+from models.motion.axes import UNITS_PER_METRE, Axes, Handed, Units, Up
 from models.motion.gaps import MIN_CONFIDENCE
 from models.motion.standards import STANDARDS
 from service.checks import About
@@ -13,12 +24,15 @@ from service.engine.trajectory import StoppedBy
 from service.example import ACTIONS_EXAMPLE, EXAMPLE
 from service.futures import BoneLengths
 from service.observation import MAX_FPS, MIN_FPS, Source
+from service.occupancy import LEVELS, MAX_MARGIN_M, MAX_REGIONS, Box, Capsule, Query, Region
 from service.quantiles import DEFAULT_LEVELS
 from service.skeletons import OwnJoints
 
 MAX_SEED = 2**53 - 1  # the largest integer that every JSON reader keeps
 MAX_ACTIONS = 16
 MAX_STOP_THRESHOLD_M = 1.0
+MAX_STREAM_HZ = 60.0
+MAX_COORDINATE = 1e7
 
 _POSES_SCHEMA = {
     "type": "array",
@@ -63,6 +77,10 @@ class SkeletonBody(_Body):
         return OwnJoints(joints=tuple(self.joints), mapping=self.map, parents=parents)
 
 
+def _listed(value: object) -> object:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
 def _kind(skeleton: object) -> str | None:
     if isinstance(skeleton, dict | SkeletonBody):
         return "own"
@@ -89,6 +107,83 @@ class AxesBody(_Body):
     def axes(self) -> Axes:
         """The same as the service uses it."""
         return Axes(up=self.up, units=self.units, handed=self.handed)
+
+
+_Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
+_Length = Annotated[float, Field(ge=0, le=MAX_COORDINATE)]
+_Point = Annotated[list[_Coordinate], Field(min_length=3, max_length=3), BeforeValidator(_listed)]
+
+
+class BoxBody(_Body):
+    """A box in the caller's axes and units, half of its size to each side of its centre."""
+
+    center: _Point
+    size: Annotated[list[_Length], Field(min_length=3, max_length=3), BeforeValidator(_listed)] = (
+        Field(description="along its own x, y and z, which are the caller's where yaw is 0")
+    )
+    yaw: float = Field(default=0.0, allow_inf_nan=False, description="radians about up")
+
+    def region(self, axes: Axes) -> Region:
+        """The same as the service uses it."""
+        return Box(
+            centre=axes.to_metres(np.array(self.center)),
+            size=np.abs(axes.to_metres(np.array(self.size))),
+            yaw=self.yaw,
+        )
+
+
+class CapsuleBody(_Body):
+    """All within a radius of a line, in the caller's axes and units; a ball if its ends are one."""
+
+    start: _Point
+    end: _Point
+    radius: _Length
+
+    def region(self, axes: Axes) -> Region:
+        """The same as the service uses it."""
+        return Capsule(
+            start=axes.to_metres(np.array(self.start)),
+            end=axes.to_metres(np.array(self.end)),
+            radius=self.radius / UNITS_PER_METRE[axes.units],
+        )
+
+
+class RegionBody(_Body):
+    """A box or a capsule."""
+
+    box: BoxBody | None = None
+    capsule: CapsuleBody | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> "RegionBody":
+        if (self.box is None) == (self.capsule is None):
+            raise PydanticCustomError("region", 'must be {"box": ...} or {"capsule": ...}')
+        return self
+
+
+class OccupancyBody(_Body):
+    """Where a robot is or will be, and how near is too near."""
+
+    regions: list[RegionBody] = Field(min_length=1, max_length=MAX_REGIONS)
+    margin_m: float = Field(
+        default=0.0,
+        ge=0,
+        le=MAX_MARGIN_M,
+        description="metres: a joint or bone, which has no width, that is at most so far from a "
+        "region is in it",
+    )
+    levels: list[Annotated[float, Field(gt=0, lt=1)]] = Field(
+        default=list(LEVELS), min_length=1, max_length=16, description="of the quantiles"
+    )
+
+    def query(self, axes: Axes) -> Query:
+        """The same as the service uses it."""
+        solids = [region.box or region.capsule for region in self.regions]
+        return Query(
+            regions=tuple(solid.region(axes) for solid in solids if solid),
+            margin_m=self.margin_m,
+            levels=tuple(self.levels),
+        )
 
 
 def _usual_axes(fields: dict[str, Any]) -> AxesBody:
@@ -163,6 +258,9 @@ class ObservedMotion(ObservedPoses):
         description="after the arrival; then the answer is what is ready, as X-Request-Timeout-"
         "Seconds says it too: the smaller one counts",
     )
+    occupancy: OccupancyBody | None = Field(
+        default=None, description="regions to watch, where `return` names occupancy"
+    )
 
 
 class PredictRequest(ObservedMotion):
@@ -189,7 +287,7 @@ class PredictRequest(ObservedMotion):
         description="seconds to predict; the model's by default; longer futures are rolled out "
         "from their own last frames, and a warning says so",
     )
-    returned: list[Literal["futures", "modes", "quantiles"]] = Field(
+    returned: list[Literal["futures", "modes", "quantiles", "occupancy"]] = Field(
         default=["futures"], min_length=1, alias="return", description="parts of the answer"
     )
     num_modes: int = Field(
@@ -225,6 +323,9 @@ class PredictActionsRequest(ObservedMotion):
         gt=0,
         description="an action that has not ended by then is cut off; at most, and by default, "
         "the model's horizon",
+    )
+    returned: list[Literal["futures", "occupancy"]] = Field(
+        default=["futures"], min_length=1, alias="return", description="parts of the answer"
     )
 
 
@@ -333,6 +434,32 @@ class Quantiles(_Body):
     calibrated: bool = Field(description="whether it was measured that they hold it so often")
 
 
+class Entry(_Body):
+    """When futures enter a region for the first time."""
+
+    never: float = Field(description="share of the futures that do not")
+    levels: list[float]
+    time_s: list[float | None] = Field(
+        description="from now: by then this share of all futures has; null where fewer ever do"
+    )
+
+
+class Distance(_Body):
+    """How near futures come to a region."""
+
+    levels: list[float]
+    distance: list[float] = Field(description="in the caller's units; 0 is within")
+
+
+class Occupancy(_Body):
+    """What the futures say of one region; shares of samples, which no measurement has widened."""
+
+    probability: list[Any] = Field(description="[frames]: of those that last so long, in it then")
+    num_lasting: list[int] = Field(description="[frames]: how many futures last so long")
+    first_entry: Entry
+    min_distance: Distance
+
+
 class PredictResponse(Answer):
     """Futures in the caller's world, skeleton, axes, units and rate."""
 
@@ -350,7 +477,31 @@ class PredictResponse(Answer):
     ] = None
     modes: list[Mode] | None = Field(default=None, description="the likeliest first")
     quantiles: Quantiles | None = None
+    occupancy: list[Occupancy] | None = Field(default=None, description="of each region")
     steps: Steps
+
+
+class StreamStart(_Body):
+    """The first message of WS /stream, and any later one that asks for something else."""
+
+    type: Literal["start"]
+    session: str | None = Field(
+        default=None, description="of a connection that was lost, whose frames are still there"
+    )
+    rate_hz: float = Field(
+        default=10.0, gt=0, le=MAX_STREAM_HZ, description="answers a second, at most"
+    )
+    options: dict[str, Any] = Field(
+        default={}, description="fields of POST /predict, without poses; a seed is drawn but once"
+    )
+
+
+class StreamFrame(_Body):
+    """A pose, and when it was seen."""
+
+    type: Literal["frame"]
+    t: float = Field(allow_inf_nan=False, description="seconds on any clock, later each time")
+    pose: list[Any] | InstanceOf[np.ndarray]
 
 
 class ActionSegment(_Body):
@@ -382,7 +533,8 @@ class PerformedFuture(_Body):
 class PredictActionsResponse(Answer):
     """Futures of actions in the caller's world, skeleton, axes, units and rate."""
 
-    futures: list[PerformedFuture]
+    futures: list[PerformedFuture] | None = None
+    occupancy: list[Occupancy] | None = Field(default=None, description="of each region")
 
 
 class ModelSummary(_Body):

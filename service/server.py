@@ -38,6 +38,7 @@ class _Server(uvicorn.Server):
             log_config=None,
             access_log=False,
             timeout_graceful_shutdown=GRACE_S,
+            ws_per_message_deflate=False,  # an answer has a megabyte, ten times a second
         )
         super().__init__(config)
         self._app = app

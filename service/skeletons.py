@@ -63,6 +63,14 @@ def sent_order(skeleton: Skeleton) -> tuple[int, ...]:
     return tuple(range(skeleton.num_joints))
 
 
+def sent_joints(asked: Skeleton | OwnJoints) -> tuple[str, ...]:
+    """The joints of a skeleton in the order of the caller's lists."""
+    if isinstance(asked, OwnJoints):
+        return tuple(asked.joints)
+    names = dict(zip(sent_order(asked), asked.joints, strict=True))
+    return tuple(names[place] for place in range(len(names)))
+
+
 def own_skeleton(
     own: OwnJoints, pose: Float[np.ndarray, "J 3"]
 ) -> tuple[Skeleton, tuple[int, ...]]:

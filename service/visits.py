@@ -15,11 +15,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.errors import ServiceError
 
 ID_HEADER = "X-Request-Id"
+SWITCHED = 101
 CLIENT_GONE = 499  # no client sees it: nobody is there any more
 
 request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 _WELL_FORMED = re.compile(r"[A-Za-z0-9._:-]{1,64}")
+_STARTS = ("http.response.start", "websocket.http.response.start", "websocket.accept")
 _OUTCOMES = {401: "rejected", 409: "cancelled", 429: "rejected", 499: "cancelled",
              503: "rejected", 504: "deadline"}  # fmt: skip
 
@@ -61,20 +63,20 @@ class Visits:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer as the application does, with the header X-Request-Id."""
-        if scope["type"] != "http":
+        if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
         asked = Headers(scope=scope).get(ID_HEADER, "")
         visit = Visit(
             request_id=asked if _WELL_FORMED.fullmatch(asked) else str(uuid4()),
-            method=scope["method"],
+            method=scope.get("method", "WEBSOCKET"),
         )
         scope.setdefault("state", {})["visit"] = visit
         token = request_id.set(visit.request_id)
 
         async def sent(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                visit.status = message["status"]
+            if message["type"] in _STARTS:
+                visit.status = message.get("status", SWITCHED)
                 MutableHeaders(scope=message)[ID_HEADER] = visit.request_id
             await send(message)
 

@@ -19,11 +19,14 @@ PATIENCE_S = 60.0
 class Live:
     """Runs until its ``with`` ends; ``sock()`` is a new connection to it."""
 
-    def __init__(self, bundles: Path, **settings: Any) -> None:
+    def __init__(
+        self, bundles: Path, *, listener: socket.socket | None = None, **settings: Any
+    ) -> None:
         self.app = create_app(Settings(bundles=bundles, threads=1, **settings))
         config = uvicorn.Config(self.app, port=0, log_config=None, timeout_graceful_shutdown=1)
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run)
+        sockets = None if listener is None else [listener]
+        self._thread = threading.Thread(target=self._server.run, args=(sockets,))
 
     def __enter__(self) -> "Live":
         self._thread.start()

@@ -66,9 +66,9 @@ def apd_of_largest(samples: Samples, *, pairs: int = 50) -> PerItem:
     first, second = np.triu_indices(samples.shape[1], k=1)
     if not len(first):
         return np.zeros(len(samples))
-    distances = np.stack([
-        np.linalg.norm(item[first] - item[second], axis=-1) for item in sequences
-    ])
+    distances = np.stack(
+        [np.linalg.norm(item[first] - item[second], axis=-1) for item in sequences]
+    )
     return np.asarray(np.sort(distances, axis=1)[:, -pairs:].mean(axis=1))
 
 

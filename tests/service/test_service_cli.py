@@ -241,4 +241,7 @@ def test_flags_are_frozen():
             "num_modes", "model", "seed", "out", "output_format", "at",
             "actions", "stop_threshold", "max_seconds_per_action", "url", "stream",
         ],
+        "stream": [
+            "file", "rate_hz", "num_samples", "deadline_ms", "model", "seed", "speed", "out", "url",
+        ],
     }  # fmt: skip
