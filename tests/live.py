@@ -67,9 +67,9 @@ class Live:
         return connection
 
 
-def until(condition: Callable[[], bool]) -> None:
+def until(condition: Callable[[], bool], *, patience_s: float = PATIENCE_S) -> None:
     """Wait for something that must become true."""
-    give_up = time.monotonic() + PATIENCE_S
+    give_up = time.monotonic() + patience_s
     while not condition():
         assert time.monotonic() < give_up, "it never became true"
         time.sleep(0.002)

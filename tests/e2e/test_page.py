@@ -31,7 +31,7 @@ FLAGS = (  # software rendering, as the machines of a CI have no GPU
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 )
-PATIENCE_MS = 30_000
+START_S, PATIENCE_MS = 240.0, 60_000  # a gate's machine may be busy
 DESK = {"width": 900, "height": 600}
 ANSWERED = "#timing[data-futures]"
 
@@ -61,7 +61,7 @@ class Server:
             stderr=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
         )
-        until(self._is_ready)
+        until(self._is_ready, patience_s=START_S)
 
     def stop(self) -> None:
         if self._process is not None:
@@ -83,9 +83,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     for name in (shipped / "DEFAULT").read_text().split():
         (folder / name).symlink_to(shipped / name)
     running = Server(folder)
-    running.start()
-    yield running
-    running.stop()
+    try:
+        running.start()
+        yield running
+    finally:
+        running.stop()
 
 
 @pytest.fixture(scope="module")

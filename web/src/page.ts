@@ -2,7 +2,7 @@
 
 import type { PredictActionsRequest } from "../client";
 import * as api from "./api";
-import { adaptTo, look, MIN_QUANTILE_SAMPLES, options, performing, questionOf, showSliders } from "./choices";
+import { adaptTo, look, options, performing, questionOf, showSliders } from "./choices";
 import { button, element, input, made } from "./dom";
 import { listenForFiles } from "./files";
 import { listenForKeys } from "./keys";
@@ -10,13 +10,14 @@ import { latest } from "./latest";
 import { Models } from "./models";
 import { ModeList } from "./modes";
 import type { Axes, Motion } from "./motion";
-import { Notice } from "./notice";
+import { Notice, type Subject } from "./notice";
 import { onPaletteChange, readPalette } from "./palette";
 import { Script } from "./script";
 import { Server } from "./server";
 import { DEMOS, demo, fromFiles } from "./sources";
 import { Stage } from "./stage";
 import { asCurl, asPython, type Question, save, type Suffix } from "./take";
+import { tellAnswer, tellMotion, tellRegions } from "./telling";
 import { Timeline } from "./timeline";
 import { type Solo, View } from "./view";
 import { Webcam } from "./webcam";
@@ -30,6 +31,7 @@ let now = 0;
 let answer: api.Answer | null = null;
 let webcam: Webcam | null = null;
 let solo: Solo = null;
+let loads = 0;
 let defaults: { predict: string | null; perform: string | null } = { predict: null, perform: null };
 
 const script = new Script(() => {
@@ -122,10 +124,12 @@ function sawFrame(found: Motion): void {
   redraw();
 }
 
-/** Show another motion; now is where most models have seen enough, or where a demo is alive. */
+/** Show another motion, unless a later one is wanted by the time it is there. */
 async function load(source: () => Promise<Motion>): Promise<void> {
+  const mine = ++loads;
   try {
     const found = await source();
+    if (mine !== loads) return;
     stopWatching();
     motion = found;
     answer = null;
@@ -133,22 +137,19 @@ async function load(source: () => Promise<Motion>): Promise<void> {
     timeline.set({ fps: found.fps, frames: found.track.frames }, now, null);
     timeline.player.time = timeline.nowSeconds;
     view.setMotion(found, now);
-    const seconds = (found.track.frames / found.fps).toFixed(1);
-    element("motion-text").textContent =
-      `${found.name}: ${seconds} s, ${found.track.joints} joints at ${Number(found.fps.toFixed(2))} Hz`;
-    for (const chip of element("demos").children) {
-      chip.setAttribute("aria-pressed", String((chip as HTMLElement).dataset.demo === found.name));
-    }
-    notice.hide();
-    await ask();
-    if (!matchMedia("(prefers-reduced-motion: reduce)").matches) timeline.player.playing = true;
-    else seek(timeline.nowSeconds + 1);
+    tellMotion(found);
+    notice.hide("motion");
+    const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    if (calm) seek(timeline.nowSeconds + 1);
+    else timeline.player.playing = true;
     showPlaying();
+    await ask();
   } catch (error) {
-    fail(error);
+    fail(error, "motion");
   }
 }
 
+/** Where a demo is alive, and most models have seen enough. */
 function firstNow({ track, fps }: Motion): number {
   const last = track.frames - 1;
   return Math.min(last, Math.max(Math.round(FIRST_NOW_S * fps), Math.round(last * 0.3)));
@@ -170,9 +171,9 @@ async function answered(inSteps: boolean): Promise<void> {
           : await api.predict(asked.body, axes);
     if (about !== motion) return; // it is about a motion that is gone
     show(found, at);
-    notice.hide();
+    notice.hide("answer");
   } catch (error) {
-    fail(error);
+    fail(error, "answer");
   }
 }
 
@@ -184,15 +185,7 @@ function show(found: api.Answer, at: number): void {
   modes.set(found);
   view.setAnswer(found, at);
   timeline.set({ fps: motion.fps, frames: motion.track.frames }, now, found);
-  const { timing, steps, roundTripMs, warnings } = found;
-  const inside = Object.values(timing).reduce((sum, ms) => sum + ms, 0);
-  const run = steps && steps.of > 1 ? ` · ${steps.run} of ${steps.of} steps` : "";
-  const told = element("timing");
-  told.textContent =
-    `${found.futures.length} futures · server ${inside.toFixed(0)} ms · round trip ${roundTripMs.toFixed(0)} ms${run}`;
-  told.title = Object.entries(timing).map(([stage, ms]) => `${stage} ${ms.toFixed(1)} ms`).join(", ");
-  Object.assign(told.dataset, { model: found.model, futures: String(found.futures.length), seed: String(found.seed) });
-  element("warnings").replaceChildren(...warnings.map((warning) => made("li", warning)));
+  tellAnswer(found);
   showLook();
 }
 
@@ -214,17 +207,8 @@ function showLook(): void {
   timeline.setSample(sample);
   script.tell(answer?.segments[sample] ?? [], answer?.fps ?? 1);
   element("legend-truth").hidden = !input("show-truth").checked;
-  element("regions-text").textContent = regionsText();
+  tellRegions(answer, input("show-regions").checked);
   redraw();
-}
-
-function regionsText(): string {
-  if (!input("show-regions").checked || !answer) return "";
-  if (performing()) return "Regions are of what comes next, not of actions.";
-  if (!answer.regions) return `Regions need ${MIN_QUANTILE_SAMPLES} futures or more.`;
-  return answer.regions.calibrated
-    ? "Of root, head and wrists; as wide as was measured on people that the model had not seen."
-    : "Of root, head and wrists; as wide as the samples say, not measured on people.";
 }
 
 function redraw(): void {
@@ -268,11 +252,11 @@ function showPlaying(): void {
 }
 
 /** Say what went wrong; where the server is away, the page goes on when it is back. */
-function fail(error: unknown): void {
+function fail(error: unknown, about: Subject = "page"): void {
   if (error instanceof api.AwayError) server.lost();
   else {
     const wantsKey = error instanceof api.ProblemError && error.problem.status === 401;
-    notice.show(error instanceof Error ? error.message : String(error), { wantsKey });
+    notice.show(error instanceof Error ? error.message : String(error), { about, wantsKey });
   }
 }
 
