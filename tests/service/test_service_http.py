@@ -287,7 +287,7 @@ def test_documents_declare_every_error(service: Service):
         assert media_type in response["content"]
     assert set(responses["200"]["content"]) == {
         "application/json", "application/msgpack", "application/x-npz", "text/event-stream",
-        "application/x-ndjson",
+        "application/x-ndjson", "model/bvh", "model/gltf-binary", "application/zip",
     }  # fmt: skip
     assert "Problem" in document["components"]["schemas"]
     assert set(document["paths"]["/requests/{request_id}"]["delete"]["responses"]) >= {
