@@ -28,7 +28,7 @@ from service.engine.trajectory import (
 )
 from service.errors import DeadlineError, EngineError, ServiceError
 
-ROWS_PER_STEP = 128
+ROWS_PER_STEP = 64
 
 Event: TypeAlias = Result | Failure | Preview
 
