@@ -1,5 +1,6 @@
 """Who may ask, how often, and how many at a time, before anything is read of a request."""
 
+import math
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
@@ -18,6 +19,8 @@ from service.errors import OverloadedError, RateLimitedError, ServiceError, Unau
 from service.problems import problem
 
 OPEN_PATHS = ("/livez", "/readyz", page.PATH)
+RETRY_FRESH_S = 0.1
+"""For how long an estimate of when to come again is told, which engines that work can spare."""
 
 
 class Guard:
@@ -42,6 +45,7 @@ class Guard:
         self._max_requests = max_requests
         self._num_requests = 0
         self._seconds_until_free = seconds_until_free
+        self._retry_after_s, self._estimated_s = 0.0, -math.inf
         self._keys = [_digest(key) for key in api_keys]
         self._rate = parse(rate_limit) if rate_limit else None
         self._limiter = MovingWindowRateLimiter(MemoryStorage())
@@ -93,10 +97,13 @@ class Guard:
 
     def _check_room(self) -> None:
         if self._num_requests >= self._max_requests:
+            if time.monotonic() > self._estimated_s + RETRY_FRESH_S:
+                self._retry_after_s = self._seconds_until_free()
+                self._estimated_s = time.monotonic()
             raise OverloadedError(
                 f"the server: found {self._num_requests} requests under way; it takes at most "
                 f"{self._max_requests}.",
-                retry_after_s=self._seconds_until_free(),
+                retry_after_s=self._retry_after_s,
             )
 
     async def _count(self, caller: str) -> None:

@@ -14,6 +14,7 @@ from prometheus_client import (
 )
 
 from service.catalog import Catalog
+from service.engine.engine import Turn
 from service.visits import Visit
 from service.worker import Outcome
 
@@ -47,6 +48,8 @@ class Metrics:
         self._steps = counter("steps", "denoising steps of requests", "model", "kind")
         self._duration = seconds("request_duration", "from arrival to the last byte", "endpoint")
         self._queue = seconds("queue_wait", "from arrival to the first step", "model")
+        self._dispatch = seconds("batch_dispatch", "choosing the rows of a step", "model")
+        self._unwanted = counter("rows_unwanted", "rows whose client left meanwhile", "model")
         self._step = seconds("step_duration", "one step of the engine", "model")
         self._encode = seconds("encode", "writing an answer", "format")
         self._preview = seconds("first_preview", "from arrival to the first preview", "model")
@@ -62,14 +65,19 @@ class Metrics:
         self._lag = gauge("event_loop_lag_seconds", "worst delay of the last ten seconds")
         self._ready = gauge("ready", "1 where predictions are answered")
         self._draining = gauge("draining", "1 once told to end")
+        self._golden = gauge(
+            "golden_check", "1 where the golden request has one answer, alone and among others",
+            "name",
+        )  # fmt: skip
         self._info = gauge("model_info", "a bundle that is ready", "name", "version", "digest")
         self._beats: dict[str, float] = {}
 
-    def stepped(self, *, model: str, rows: int, waiting: int, seconds: float) -> None:
+    def stepped(self, *, model: str, turn: Turn, seconds: float) -> None:
         """A step of the engine has run."""
-        del waiting  # told by the worker's load when it is asked for
-        self._rows.labels(model).observe(rows)
-        self._in_flight.labels(model).set(rows)
+        self._rows.labels(model).observe(turn.num_rows)
+        self._unwanted.labels(model).inc(turn.num_unwanted)
+        self._dispatch.labels(model).observe(turn.dispatch_s)
+        self._in_flight.labels(model).set(turn.num_rows)
         self._step.labels(model).observe(seconds)
         self._beats[model] = perf_counter()
 
@@ -121,6 +129,8 @@ class Metrics:
         self._ready.set(catalog.state == "ready" and not draining)
         self._draining.set(draining)
         for entry in catalog.entries.values():
+            if entry.state != "loading":
+                self._golden.labels(entry.name).set(entry.golden_digest is not None)
             if entry.worker is None or entry.manifest is None:
                 continue
             load = entry.worker.load()

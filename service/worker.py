@@ -12,7 +12,7 @@ from time import perf_counter
 from types import TracebackType
 from typing import Literal, NoReturn, Protocol, TypeAlias, runtime_checkable
 
-from service.engine.engine import Engine
+from service.engine.engine import Engine, Turn
 from service.engine.trajectory import Failure, Preview, Request, Result
 from service.errors import (
     CancelledRequestError,
@@ -56,8 +56,8 @@ class Load:
 class Observer(Protocol):
     """Is told what happens, from the worker's threads and its callers'."""
 
-    def stepped(self, *, model: str, rows: int, waiting: int, seconds: float) -> None:
-        """A step of so many rows has run, and so many rows wait."""
+    def stepped(self, *, model: str, turn: Turn, seconds: float) -> None:
+        """A step has run."""
 
     def ended(  # noqa: PLR0913 - all that a request has been
         self,
@@ -83,6 +83,7 @@ class _Job:
     preview: Callable[[Preview], bytes] | None = None
     key: str | None = None
     arrived_s: float = field(default_factory=perf_counter)
+    written_s: float = 0.0
     answered: Future[bytes] = field(default_factory=Future)
     shown: deque[bytes] = field(default_factory=lambda: deque(maxlen=1))
     steps_shown: int = 0
@@ -135,7 +136,9 @@ class Worker:
         job = _Job(request=request, answer=answer, key=request_key)
         request_id = self._add(job)
         try:
-            return await asyncio.wrap_future(job.answered)
+            body = await asyncio.wrap_future(job.answered)
+            self._engine.costs.learn("deliver", 1, perf_counter() - job.written_s)
+            return body
         except asyncio.CancelledError:
             self._cancel(request_id)
             raise
@@ -273,10 +276,7 @@ class Worker:
         turn = self._engine.turn(shares=len(self._threads))
         if self._observer is not None and turn.num_rows:
             self._observer.stepped(
-                model=self._engine.manifest.name,
-                rows=turn.num_rows,
-                waiting=self._engine.num_waiting,
-                seconds=perf_counter() - started_s,
+                model=self._engine.manifest.name, turn=turn, seconds=perf_counter() - started_s
             )
         with self._changed:
             self._changed.notify_all()
@@ -322,6 +322,7 @@ class Worker:
             self._fail(job, _unforeseen(), queue_s=ended.queued_s)
             return
         self._tell(job, "finished", queue_s=ended.queued_s, result=ended)
+        job.written_s = perf_counter()
         with suppress(InvalidStateError):  # the caller left meanwhile
             job.answered.set_result(body)
 

@@ -110,18 +110,20 @@ def fit_bone_lengths(
 
     A bone of no length takes the direction of the bone above it, or up.
     """
-    result = np.array(positions)
-    directions = np.zeros_like(result)
-    directions[..., 0, 2] = 1.0
+    # Joints and axes first: every operation then goes along a row of all poses.
+    rows = np.ascontiguousarray(np.moveaxis(positions, (-2, -1), (0, 1)))
+    result = np.array(rows)
+    directions = np.zeros_like(rows)
+    directions[0, 2] = 1.0
     for j, parent in enumerate(parents):
         if parent < 0:
             continue
-        bone = positions[..., j, :] - positions[..., parent, :]
-        length = np.linalg.norm(bone, axis=-1, keepdims=True)
+        bone = rows[j] - rows[parent]
+        length = np.sqrt(bone[0] ** 2 + bone[1] ** 2 + bone[2] ** 2)
         unit = bone / np.maximum(length, 1e-9)
-        directions[..., j, :] = np.where(length > 1e-9, unit, directions[..., parent, :])
-        result[..., j, :] = result[..., parent, :] + directions[..., j, :] * lengths[j]
-    return result
+        directions[j] = np.where(length > 1e-9, unit, directions[parent])
+        result[j] = result[parent] + directions[j] * lengths[j]
+    return np.ascontiguousarray(np.moveaxis(result, (0, 1), (-2, -1)))
 
 
 def yaw(

@@ -52,6 +52,12 @@ def gathered(names: Iterable[str], parts: Sequence[Part]) -> Tensors:
     }
 
 
+def joined(parts: Sequence[Part]) -> Context:
+    """The context of all rows of all parts, which are alike in what they have encoded."""
+    first, _ = parts[0]
+    return Context(tensors=gathered(first.tensors, parts), encoded=first.encoded)
+
+
 def _batch(
     parts: Sequence[tuple[Shaped[np.ndarray, "..."], int]],
 ) -> Shaped[np.ndarray, "B ..."]:

@@ -28,17 +28,25 @@ from service.engine.trajectory import (
 )
 from service.errors import DeadlineError, EngineError, ServiceError
 
-ROWS_PER_STEP = 128
+ROWS_PER_STEP = 64
+THERE_AND_BACK = 2
+"""A request was on its way for as long as an answer is, before anybody could count it."""
 
 Event: TypeAlias = Result | Failure | Preview
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Turn:
-    """A step that has run: of how many rows, and what came of it."""
+    """A step that has run: of how many rows, and what came of it.
+
+    ``num_unwanted`` are the rows whose caller left while they ran; ``dispatch_s`` were spent on
+    choosing the rows.
+    """
 
     num_rows: int
     events: list[Event]
+    num_unwanted: int = 0
+    dispatch_s: float = 0.0
 
 
 class Engine:
@@ -128,18 +136,24 @@ class Engine:
 
         Where it raises, the requests of its rows never end by themselves.
         """
+        started_s = self._clock()
         with self._lock:
             taken, rows, failures = self._taken(shares)
+        dispatch_s = self._clock() - started_s
+        unwanted = 0
         advanced: list[Trajectory | Samples] = []
         errors: dict[int, ServiceError] = {}
         try:
             advanced = self._advanced(rows, errors)
         finally:
             with self._lock:
+                unwanted = sum(len(some) for some in taken if some.request_id not in self._jobs)
                 failures += [self._failure(i, e) for i, e in errors.items() if i in self._jobs]
                 ended, shown = self._settled(taken, advanced)
         return Turn(
             num_rows=sum(map(len, taken)),
+            num_unwanted=unwanted,
+            dispatch_s=dispatch_s,
             events=[
                 *failures,
                 *(job.preview(step, some) for job, step, some in shown),
@@ -201,8 +215,11 @@ class Engine:
         ahead_s = 0.0
         for request_id, job, waiting, is_begun in self._hasty():
             step = {"encode": sum(map(len, unencoded(rows.context for rows in waiting)))}
-            last = {"decode": job.num_rows - job.num_whole, "answer": job.request.num_samples}
-            left_s = job.deadline_s - now_s - ahead_s
+            left = job.num_rows - job.num_whole
+            last = {"decode": left, "answer": job.request.num_samples, "deliver": THERE_AND_BACK}
+            # Rows that another thread has come back a step later.
+            elsewhere = size if left > sum(map(len, waiting)) else 0
+            left_s = job.deadline_s - now_s - ahead_s - self.costs.expected(step=elsewhere)
             ahead_s += self.costs.expected(**last) / shares
             if is_begun:
                 if left_s < self.costs.at_most(**step, step=size, **last):

@@ -1,18 +1,18 @@
 """Progress by performing: chunk after chunk of an action until it ends, then the next action."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int64
 
 from models.bundle import ActionsSpec
-from service.engine.context import Context, Tensors, unencoded
+from service.engine.context import Context, Tensors, joined, unencoded
 from service.engine.costs import Costs
 from service.engine.runner import Runner
 from service.engine.sampling import noise
-from service.engine.stopping import rest_frame
+from service.engine.stopping import rest_frames
 from service.engine.trajectory import Request, Samples, Segment, StoppedBy
 
 NEXT = "next_"
@@ -21,52 +21,84 @@ EARLIEST_END = "earliest_end"
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Performance:
-    """One sample of one request: the frames so far, and what the present action goes on from.
+    """Samples of one request at the same chunk of the same action.
 
-    ``frames`` are those of the observation and all that was made since; ``segments`` tell the
-    actions that have ended. Before the first turn there is no ``noise``.
+    ``past`` has the frames of each before this action, those of the observation included, and
+    ``segments`` the actions that made them; ``chunks`` are those of this action so far. Before its
+    first there is no ``noise``.
     """
 
     request_id: int
     request: Request
-    sample_index: int
+    sample_indices: Int64[np.ndarray, "n"]
     turns_left: int
-    frames: Float[np.ndarray, "F J 3"]
     context: Context
-    noise: Float[np.ndarray, "..."] | None = None
-    segments: tuple[Segment, ...] = ()
+    past: tuple[Float[np.ndarray, "_ J 3"], ...]
+    segments: tuple[tuple[Segment, ...], ...]
+    chunks: tuple[Float[np.ndarray, "n _ J 3"], ...] = ()
+    noise: Float[np.ndarray, "n ..."] | None = None
     is_cut: bool = False
 
     def __len__(self) -> int:
-        """Each stands by itself."""
-        return 1
+        """How many samples these are."""
+        return len(self.sample_indices)
 
     @property
-    def sample_indices(self) -> Shaped[np.ndarray, "1"]:
-        """The one sample that this is."""
-        return np.array([self.sample_index])
+    def actions_ended(self) -> int:
+        """How many of the request's actions are behind these samples."""
+        return len(self.segments[0])
+
+    @property
+    def num_made(self) -> int:
+        """The frames of this action so far."""
+        return sum(chunk.shape[1] for chunk in self.chunks)
 
     @property
     def steps_behind(self) -> int:
         """1 once there are frames to show."""
-        return int(len(self.frames) > len(self.request.observation))
+        return int(bool(self.chunks) or self.actions_ended > 0)
 
     @property
     def shown(self) -> None:
         """Nothing: a performance is one step."""
 
-    @property
-    def start(self) -> int:
-        """The frame of the future at which the present action starts."""
-        return self.segments[-1].end if self.segments else 0
-
     def cut(self) -> "Performance":
-        """The same sample, which ends in its next turn with the frames that it has."""
+        """The same samples, which end in their next turn with the frames that they have."""
         return replace(self, is_cut=True)
 
     def split(self, count: int) -> tuple["Performance", "Performance"]:
-        """Nothing: a single sample has no parts."""
-        raise ValueError(f"count: found {count}; a single sample cannot be split.")
+        """The first ``count`` samples, and the others."""
+        rows = np.arange(len(self))
+        return self.part(rows[:count]), self.part(rows[count:])
+
+    def part(self, rows: Int64[np.ndarray, "m"]) -> "Performance":
+        """Some of the samples."""
+        if len(rows) == len(self):
+            return self
+        return replace(
+            self,
+            sample_indices=self.sample_indices[rows],
+            context=self.context.part(rows),
+            past=tuple(self.past[row] for row in rows),
+            segments=tuple(self.segments[row] for row in rows),
+            chunks=tuple(chunk[rows] for chunk in self.chunks),
+            noise=None if self.noise is None else self.noise[rows],
+        )
+
+    def ended(
+        self, row: int, num_frames: int, *, stopped: bool
+    ) -> tuple[Float[np.ndarray, "F J 3"], tuple[Segment, ...]]:
+        """One sample's frames and segments when this action has so many frames."""
+        frames = np.concatenate([self.past[row], *(chunk[row] for chunk in self.chunks)])
+        before = self.segments[row]
+        start = before[-1].end if before else 0
+        segment = Segment(
+            action=self.request.actions[len(before)],
+            start=start,
+            end=start + num_frames,
+            stopped=stopped,
+        )
+        return frames[: len(self.past[row]) + num_frames], (*before, segment)
 
 
 class Performer:
@@ -81,122 +113,143 @@ class Performer:
         self._draws = self._encoder_draws or runner.takes("decoder", "noise")
 
     def start(self, request_id: int, request: Request) -> list[Performance]:
-        """Every sample before its first action, its context shared as far as noise permits."""
-        observation, action = request.observation, request.actions[0]
-        shared = self._context(observation, action)
-        return [
-            Performance(
-                request_id=request_id,
-                request=request,
-                sample_index=sample_index,
-                turns_left=self._turns(request, num_actions=len(request.actions)),
-                frames=observation,
-                context=self._context(observation, action) if self._encoder_draws else shared,
-            )
-            for sample_index in range(request.num_samples if self._draws else 1)
-        ]
+        """All samples before their first action; they share a context."""
+        num_samples = request.num_samples if self._draws else 1
+        samples = Performance(
+            request_id=request_id,
+            request=request,
+            sample_indices=np.arange(num_samples),
+            turns_left=self._turns(request, num_actions=len(request.actions)),
+            context=_before(request.observation[None], action=request.actions[0]),
+            past=(request.observation,) * num_samples,
+            segments=((),) * num_samples,
+        )
+        return [samples]
 
     def advance(self, rows: Sequence[Performance]) -> list[Performance | Samples]:
         """Make the next chunk of each row; where an action ends, turn to the next one."""
-        ended = [self._ended(row) for row in rows if row.is_cut]
-        going = [row for row in rows if not row.is_cut]
-        begun = [row for row in going if row.noise is not None]
-        running = [*begun, *self._drawn([row for row in going if row.noise is None])]
+        ended = [samples for part in rows if part.is_cut for samples in self._cut(part)]
+        running = [self._drawn(part) for part in _joined(part for part in rows if not part.is_cut)]
         if not running:
             return [*ended]
-        waiting = unencoded(row.context for row in running)
+        waiting = unencoded(part.context for part in running)
         if waiting:
-            with self._costs.timed("encode", len(waiting)):
+            with self._costs.timed("encode", sum(map(len, waiting))):
                 self._runner.encode(waiting)
-        drawn = np.stack([row.noise for row in running if row.noise is not None])
-        with self._costs.timed("step", len(running)):
-            parts = [(row.context, 1) for row in running]
+        drawn = np.concatenate([part.noise for part in running if part.noise is not None])
+        with self._costs.timed("step", len(drawn)):
+            parts = [(part.context, len(part)) for part in running]
             outputs = self._runner.run("decoder", {"noise": drawn}, parts)
+        after: list[Performance | Samples] = [*ended]
+        start = 0
+        for part in running:
+            end = start + len(part)
+            after += self._continued(part, {name: t[start:end] for name, t in outputs.items()})
+            start = end
+        return after
+
+    def _continued(self, part: Performance, outputs: Tensors) -> list[Performance | Samples]:
+        """The samples with their next chunk; those whose action it ends, before the next action."""
+        before, longest = part.num_made, part.request.max_frames or self._manifest.horizon
+        # A copy: what the graph gave holds the rows of every request.
+        chunk = outputs["future"][:, : longest - before].copy()
         state = {
             name.removeprefix(NEXT): values
             for name, values in outputs.items()
             if name.startswith(NEXT)
         }
-        continued = [
-            self._continued(
-                row,
-                outputs["future"][i],
-                {name: values[i : i + 1] for name, values in state.items()},
-                earliest_end=int(outputs[EARLIEST_END][i, 0]) if EARLIEST_END in outputs else 0,
-            )
-            for i, row in enumerate(running)
-        ]
-        return [*ended, *continued]
+        context = joined([(part.context, len(part))])
+        part = replace(
+            part,
+            turns_left=part.turns_left - 1,
+            chunks=(*part.chunks, chunk),
+            context=Context(tensors=context.tensors | state, encoded=True),
+        )
+        rest = self._rests(part, before, outputs.get(EARLIEST_END))
+        is_over = (rest >= 0) | (part.num_made >= longest)
+        after: list[Performance | Samples] = []
+        if not is_over.all():
+            after.append(part.part(np.flatnonzero(~is_over)))
+        if is_over.any():
+            after += self._turned(part.part(np.flatnonzero(is_over)), rest[is_over])
+        return after
 
-    def _continued(
+    def _rests(
         self,
-        row: Performance,
-        chunk: Float[np.ndarray, "C J 3"],
-        state: Tensors,
-        *,
-        earliest_end: int,
-    ) -> Performance | Samples:
-        request, spec = row.request, self._spec
-        frames = np.concatenate([row.frames, chunk])
-        before = self._manifest.num_observed + row.start
-        longest = request.max_frames or self._manifest.horizon
-        action = request.actions[len(row.segments)]
-        shortest = max(spec.min_frames, earliest_end)
-        made = frames[before : before + longest]
-        rest = rest_frame(
-            made,
-            # Windows that ended before this chunk were judged with the chunk before.
-            start=max(shortest, len(row.frames) - before - spec.stop_window + 2) - 1,
-            window=spec.stop_window,
-            threshold_m=request.stop_threshold_m or spec.stop_threshold_m,
+        part: Performance,
+        before: int,
+        earliest_end: Float[np.ndarray, "n 1"] | None,
+    ) -> Int64[np.ndarray, "n"]:
+        """The frame of this action at which each sample comes to rest in the last chunk, or -1."""
+        spec, window = self._spec, self._spec.stop_window
+        shortest = np.full(len(part), spec.min_frames)
+        if earliest_end is not None:
+            shortest = np.maximum(shortest, earliest_end[:, 0].astype(np.int64))
+        # Windows that ended before this chunk were judged with the chunk before.
+        start = np.maximum(shortest, before - window + 2) - 1
+        skipped, chunks = 0, part.chunks
+        while len(chunks) > 1 and skipped + chunks[0].shape[1] <= before - window + 1:
+            skipped, chunks = skipped + chunks[0].shape[1], chunks[1:]
+        rest = rest_frames(
+            chunks[0] if len(chunks) == 1 else np.concatenate(chunks, axis=1),
+            start=start - skipped,
+            window=window,
+            threshold_m=part.request.stop_threshold_m or spec.stop_threshold_m,
         )
-        if rest is None and len(made) < longest:
-            context = Context(tensors=row.context.tensors | state, encoded=True)
-            return replace(row, turns_left=row.turns_left - 1, frames=frames, context=context)
-        segment = Segment(
-            action=action,
-            start=row.start,
-            end=row.start + (len(made) if rest is None else rest + 1),
-            stopped=rest is not None,
-        )
-        return self._turned(
-            replace(
-                row,
-                frames=frames[: self._manifest.num_observed + segment.end],
-                segments=(*row.segments, segment),
-            )
-        )
+        return np.where(rest < 0, rest, rest + skipped)
 
-    def _turned(self, row: Performance) -> Performance | Samples:
-        """A row whose action has just ended, before its next one; its sample after the last."""
-        actions = row.request.actions[len(row.segments) :]
+    def _turned(
+        self,
+        part: Performance,
+        rest: Int64[np.ndarray, "n"],
+    ) -> list[Performance | Samples]:
+        """Samples whose action has just ended, before the next one; after the last, whole."""
+        found = [
+            part.ended(row, part.num_made if frame < 0 else frame + 1, stopped=frame >= 0)
+            for row, frame in enumerate(rest.tolist())
+        ]
+        actions = part.request.actions[part.actions_ended + 1 :]
         if not actions:
-            return self._whole(row, "end")
-        seen = row.frames[-self._manifest.num_observed :]
-        return replace(
-            row,
-            turns_left=self._turns(row.request, num_actions=len(actions)),
+            return [self._whole(part, row, *one, stopped_by="end") for row, one in enumerate(found)]
+        seen = np.stack([frames[-self._manifest.num_observed :] for frames, _ in found])
+        following = replace(
+            part,
+            turns_left=self._turns(part.request, num_actions=len(actions)),
+            context=_before(seen, action=actions[0]),
+            past=tuple(frames for frames, _ in found),
+            segments=tuple(segments for _, segments in found),
+            chunks=(),
             noise=None,
-            context=self._context(seen, actions[0]),
         )
+        return [following]
 
-    def _ended(self, row: Performance) -> Samples:
-        """The sample of a row that was cut: its action stops with the frames so far."""
-        num_frames = len(row.frames) - self._manifest.num_observed
-        if num_frames > row.start:
-            action = row.request.actions[len(row.segments)]
-            last = Segment(action=action, start=row.start, end=num_frames, stopped=False)
-            row = replace(row, segments=(*row.segments, last))
-        return self._whole(row, "deadline")
+    def _cut(self, part: Performance) -> list[Samples]:
+        """Samples that were cut: their action stops with the frames so far."""
+        made = part.num_made
+        found = [
+            part.ended(row, made, stopped=False) if made else (part.past[row], part.segments[row])
+            for row in range(len(part))
+        ]
+        return [
+            self._whole(part, row, *one, stopped_by="deadline") for row, one in enumerate(found)
+        ]
 
-    def _whole(self, row: Performance, stopped_by: StoppedBy) -> Samples:
+    def _whole(
+        self,
+        part: Performance,
+        row: int,
+        frames: Float[np.ndarray, "F J 3"],
+        segments: tuple[Segment, ...],
+        *,
+        stopped_by: StoppedBy,
+    ) -> Samples:
         return Samples(
-            request_id=row.request_id,
-            sample_indices=row.sample_indices,
-            futures=row.frames[None, self._manifest.num_observed :],
+            request_id=part.request_id,
+            sample_indices=part.sample_indices[row : row + 1],
+            futures=frames[None, self._manifest.num_observed :],
             steps_run=1,
             stopped_by=stopped_by,
-            segments=(row.segments,),
+            segments=(segments,),
         )
 
     def _turns(self, request: Request, *, num_actions: int) -> int:
@@ -204,25 +257,54 @@ class Performer:
         longest = request.max_frames or self._manifest.horizon
         return num_actions * -(-longest // self._spec.chunk_frames)
 
-    def _drawn(self, rows: Sequence[Performance]) -> list[Performance]:
-        """The rows with noise for their present actions."""
-        drawn: list[Performance] = []
-        for _, group in groupby(rows, lambda row: (row.request_id, len(row.segments))):
-            alike = list(group)
-            draws = noise(
-                self._manifest.x_t_shape,
-                seed=alike[0].request.seed,
-                sample_indices=[row.sample_index for row in alike],
-                draw=len(alike[0].segments),
-            )
-            drawn += [self._with_noise(row, own) for row, own in zip(alike, draws, strict=True)]
-        return drawn
-
-    def _with_noise(self, row: Performance, own: Float[np.ndarray, "..."]) -> Performance:
-        context = row.context
+    def _drawn(self, part: Performance) -> Performance:
+        """The samples with noise for their present action."""
+        if part.noise is not None:
+            return part
+        drawn = noise(
+            self._manifest.x_t_shape,
+            seed=part.request.seed,
+            sample_indices=part.sample_indices.tolist(),
+            draw=part.actions_ended,
+        )
+        context = part.context
         if self._encoder_draws:
-            context = Context(tensors=context.tensors | {"noise": own[None]})
-        return replace(row, noise=own, context=context)
+            each = joined([(context, len(part))])
+            context = Context(tensors=each.tensors | {"noise": drawn})
+        return replace(part, noise=drawn, context=context)
 
-    def _context(self, observation: Float[np.ndarray, "T J 3"], action: int) -> Context:
-        return Context(tensors={"observation": observation[None], "action": np.array([action])})
+
+def _before(observation: Float[np.ndarray, "B T J 3"], *, action: int) -> Context:
+    """What is known of rows before they begin an action."""
+    return Context(
+        tensors={"observation": observation, "action": np.full(len(observation), action)}
+    )
+
+
+def _joined(rows: Iterable[Performance]) -> list[Performance]:
+    """The same samples, those at the same chunk of the same action of a request as one."""
+
+    def state(part: Performance) -> tuple[int, int, int, bool]:
+        return part.request_id, part.actions_ended, part.num_made, part.context.encoded
+
+    groups = [list(parts) for _, parts in groupby(sorted(rows, key=state), state)]
+    return [_one(parts) for parts in groups]
+
+
+def _one(parts: Sequence[Performance]) -> Performance:
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    drawn = [part.noise for part in parts if part.noise is not None]
+    is_shared = all(part.context is first.context for part in parts)
+    return replace(
+        first,
+        sample_indices=np.concatenate([part.sample_indices for part in parts]),
+        context=first.context
+        if is_shared
+        else joined([(part.context, len(part)) for part in parts]),
+        past=tuple(past for part in parts for past in part.past),
+        segments=tuple(segments for part in parts for segments in part.segments),
+        chunks=tuple(map(np.concatenate, zip(*(part.chunks for part in parts), strict=True))),
+        noise=np.concatenate(drawn) if drawn else None,
+    )

@@ -1,25 +1,29 @@
 """Who goes next: the tightest deadline, then the least work left, and a share for everybody.
 
 A turn runs at most ``rows_per_step`` rows, and no more than its thread's share of all that are
-under way. Half of it goes to requests in the order of
+under way. They go to requests in the order of
 
 1. their deadlines, where these are tight: the work left would take half of the time left or more;
 2. their work left, turns times rows, so that a short request passes the long ones, and of equal
    ones that which came first ends first;
 3. their arrival.
 
-The other half goes row by row in turn among all requests that have rows to spare, to the one that
-has waited longest for such a row first, so that none starves. Within a request the rows that have
-waited longest go first, and its samples advance together.
+Of these, an eighth goes round instead: to the request that has waited longest for it, so that none
+starves. More would have all requests half done and none whole, and a turn of a few rows of each
+costs more than one of many rows of few. Within a request the rows that have waited longest go
+first, and its samples advance together.
 """
 
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic
+from typing import Generic
 
 from service.engine.rows import RowsT
+
+GOES_ROUND = 8
+"""One of so many rows of a turn does."""
 
 
 @dataclass(kw_only=True, slots=True, eq=False)
@@ -97,7 +101,7 @@ class Scheduler(Generic[RowsT]):
 
         total = self.num_next(shares=shares)
         counts: dict[_Queue[RowsT], int] = {}
-        left = total - total // 2
+        left = total - (max(1, total // GOES_ROUND) if total > 1 else 0)
         waiting = sorted((q for q in self._queues.values() if q.num_waiting), key=order)
         for queue in waiting:
             counts[queue] = min(left, queue.num_waiting)
@@ -154,21 +158,14 @@ class Scheduler(Generic[RowsT]):
         self.num_waiting += len(rows)
 
     def _share(self, counts: dict[_Queue[RowsT], int], left: int) -> None:
-        spare = deque(sorted((q for q in counts if counts[q] < q.num_waiting), key=_last_share))
-        while left:
-            queue = spare.popleft()
-            count = 1 if spare else left
-            counts[queue] += count
-            left -= count
-            self._num_shares += 1
-            queue.last_share = self._num_shares
-            if counts[queue] < queue.num_waiting:
-                spare.append(queue)
+        for queue in sorted(counts, key=lambda queue: (counts[queue] > 0, queue.last_share)):
+            count = min(left, queue.num_waiting - counts[queue])
+            if count:
+                counts[queue] += count
+                left -= count
+                self._num_shares += 1
+                queue.last_share = self._num_shares
 
     def _forget(self, queue: _Queue[RowsT]) -> None:
         if queue.removed and not queue.num_running:
             self._queues.pop(queue.request_id, None)
-
-
-def _last_share(queue: _Queue[Any]) -> int:
-    return queue.last_share

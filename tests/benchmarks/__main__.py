@@ -68,7 +68,7 @@ def main(
     found, peak_mb, start_s = measured(rounds, singles=singles, seconds=seconds)
     manifest = read_manifest(BUNDLES / (BUNDLES / "DEFAULT").read_text().split()[0])
     rows = table(found, peak_mb=peak_mb, start_s=start_s)
-    performed = actions.table(BUNDLES / "wat", rounds=1 if quick else 7, threads=cores)
+    performed = actions.table(BUNDLES / "wat", rounds=1 if quick else 7, cores=cores)
     machine = f"{cores} cores of {processor()}, {datetime.now(UTC):%Y-%m-%d}"
     text = "\n".join(
         [
@@ -125,6 +125,7 @@ def table(rounds: list[Figures], *, peak_mb: float, start_s: float) -> list[Row]
     mid = {name: median(figures[name] for figures in rounds) for name in rounds[0]}
     share = {name: mean(figures[name] for figures in rounds) for name in ("in_time", "polite")}
     left = max(figures["steps_after_leaving"] for figures in rounds)
+    since = max(figures["steps_since_look"] for figures in rounds)
     faster, times, percent = "{:.1f} x", "{:.2f}", "{:.1%}"
     return [
         Row(name="one request, compute", wanted=14, value=mid["compute"], form=faster,
@@ -157,7 +158,8 @@ def table(rounds: list[Figures], *, peak_mb: float, start_s: float) -> list[Row]
             "ten-step one, in that crowd"),
         Row(name="steps still computed after a disconnect", wanted=1, value=left, form=times,
             sense="at most",
-            note=f"the worst; {LEAVING_SAMPLES} futures, since the last look at its metrics"),
+            note=f"the worst, by the server's count; {LEAVING_SAMPLES} futures; since the client's "
+            f"last look at its metrics {since:.1f}"),
         Row(name="peak memory of the server", wanted=400, value=peak_mb, form="{:.0f} MB",
             sense="at most", note="VmHWM, after all of this"),
         Row(name=f"/livez, p99 at {CLIENTS} clients", wanted=5, value=mid["livez_p99_ms"],

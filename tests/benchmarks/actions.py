@@ -1,5 +1,6 @@
 """Speed of actions as ratios: the engine against the same network in PyTorch eager."""
 
+import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,9 +12,10 @@ from torch import Tensor
 
 from models.bundle import read_manifest
 from models.system import Graph, Recipe
-from service.engine.engine import Engine, predict
+from service.engine.engine import Engine
 from service.engine.runner import Runner
 from service.engine.trajectory import Request
+from service.worker import Limits, Worker
 from training.cli import load_recipe
 from training.export import unstopped
 
@@ -22,15 +24,15 @@ RECIPE = "models.systems.wat.recipes:mocap"
 FRAMES_PER_STEP = 5
 
 
-def table(bundle: Path, *, rounds: int, threads: int) -> list[tuple[str, float, str]]:
+def table(bundle: Path, *, rounds: int, cores: int) -> list[tuple[str, float, str]]:
     """What ran, its milliseconds, and how often it fits into what."""
     found = medians(
         {
             "eager": stepped(load_recipe(RECIPE), frames_per_step=FRAMES_PER_STEP),
-            "longest": engine_on(bundle, num_actions=1, threads=threads, to_the_end=True),
-            "one": engine_on(bundle, num_actions=1, threads=threads),
-            "two": engine_on(bundle, num_actions=2, threads=threads),
-            "four": engine_on(bundle, num_actions=4, threads=threads),
+            "longest": served_on(bundle, num_actions=1, cores=cores, to_the_end=True),
+            "one": served_on(bundle, num_actions=1, cores=cores),
+            "two": served_on(bundle, num_actions=2, cores=cores),
+            "four": served_on(bundle, num_actions=4, cores=cores),
         },
         rounds=rounds,
     )
@@ -81,18 +83,17 @@ def outputs(graph: Graph, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return dict(zip(graph.outputs, values, strict=True))
 
 
-def engine_on(
-    bundle: Path, *, num_actions: int, threads: int, to_the_end: bool = False
-) -> Callable[[], np.ndarray]:
-    """One request of N samples through the service's engine."""
+def served_on(
+    bundle: Path, *, num_actions: int, cores: int, to_the_end: bool = False
+) -> Callable[[], bytes]:
+    """One request of N samples, whose rows a thread for each core shares, as the server has it."""
     manifest = read_manifest(bundle)
-    engine = Engine(
-        Runner(unstopped(manifest) if to_the_end else manifest, bundle, threads=threads)
-    )
+    engine = Engine(Runner(unstopped(manifest) if to_the_end else manifest, bundle))
+    worker = Worker(engine, threads=cores, limits=Limits(max_requests=1, max_rows=NUM_SAMPLES))
     request = Request(
         observation=walking().astype(np.float32),
         num_samples=NUM_SAMPLES,
         seed=1,
         actions=(0,) * num_actions,
     )
-    return lambda: predict(engine, request).futures
+    return lambda: asyncio.run(worker.predict(request, lambda result, _: result.futures.tobytes()))

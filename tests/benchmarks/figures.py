@@ -22,6 +22,7 @@ OVERLOAD = 10
 LEAVERS = 5
 LEAVING_SAMPLES = 200
 ROWS = "motion_batch_rows_sum"
+UNWANTED = "motion_rows_unwanted_total"
 DEADLINES = 20
 
 Figures = dict[str, float]
@@ -47,7 +48,7 @@ def figures_of_a_round(bench: Bench) -> Figures:
     mixed = _mixed(bench, single)
     late = _deadlines(bench, mixed)
     over = _overloaded(bench, crowd)
-    return single | crowd | mixed | late | over | {"steps_after_leaving": _after_leaving(bench)}
+    return single | crowd | mixed | late | over | _after_leaving(bench)
 
 
 def _single(bench: Bench) -> Figures:
@@ -161,17 +162,23 @@ def _overloaded(bench: Bench, crowd: Figures) -> Figures:
     }
 
 
-def _after_leaving(bench: Bench) -> float:
-    """Steps of a large request that ran after its client had left; the most of a few."""
+def _after_leaving(bench: Bench) -> Figures:
+    """Steps of a large request that ran in vain after its client had left; the most of a few.
+
+    Those that ran when the server learnt of it, by its own count, and all since the client last
+    looked at its metrics before it left.
+    """
     server = bench.throughput
     asked = _asking(_body(num_samples=LEAVING_SAMPLES))
-    most = 0.0
+    vain, since = 0.0, 0.0
     for _ in range(LEAVERS):
+        before = server.metric(UNWANTED)
         left = bench.loader.submit(
             leave, server.port, asked, metric=ROWS, after=2 * LEAVING_SAMPLES
         ).result()
-        most = max(most, (_rows_when_idle(server) - left) / LEAVING_SAMPLES)
-    return most
+        since = max(since, (_rows_when_idle(server) - left) / LEAVING_SAMPLES)
+        vain = max(vain, (server.metric(UNWANTED) - before) / LEAVING_SAMPLES)
+    return {"steps_after_leaving": vain, "steps_since_look": since}
 
 
 def _rows_when_idle(server: Server) -> float:

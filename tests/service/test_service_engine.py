@@ -1,5 +1,5 @@
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice, zip_longest
 from pathlib import Path
@@ -356,6 +356,27 @@ def test_cancelled_request_frees_its_rows(bundles: Path):
     engine.cancel(engine.add(request(num_samples=50)))
     assert engine.num_requests == 0
     assert engine.step() == []
+
+
+class LeavingRunner(Runner):
+    """A caller leaves while the first step runs."""
+
+    leave: Callable[[], object] = staticmethod(lambda: None)
+
+    def run(self, role: str, tensors: Tensors, parts: Sequence[Part]) -> Tensors:
+        self.leave()
+        return super().run(role, tensors, parts)
+
+
+def test_rows_whose_caller_left_while_they_ran_are_counted(bundles: Path):
+    folder = bundles / "diffusion"
+    runner = LeavingRunner(read_manifest(folder), folder)
+    engine = Engine(runner)
+    leaver = engine.add(request(num_samples=3))
+    engine.add(request(num_samples=2))
+    runner.leave = lambda: engine.cancel(leaver)
+    turns = [engine.turn(), engine.turn()]
+    assert [(turn.num_rows, turn.num_unwanted) for turn in turns] == [(5, 3), (2, 0)]
 
 
 @pytest.mark.parametrize(

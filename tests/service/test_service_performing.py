@@ -1,5 +1,6 @@
 """The engine on bundles that perform actions."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,10 @@ from tiny_bundles import (
 )
 
 from models.bundle import read_manifest
-from service.engine.context import Context, Tensors
+from service.engine.context import Part, Tensors
 from service.engine.engine import Engine, predict
 from service.engine.runner import Runner
-from service.engine.stopping import rest_frame
+from service.engine.stopping import rest_frames
 from service.engine.trajectory import Failure, Request, Result, Segment
 from service.errors import FieldError, NonFiniteError
 
@@ -70,11 +71,16 @@ def slow_obvious_sample(
             chunk, pose = decoder.run(None, {"noise": noise[None], "goal": goal, "pose": pose})
             chunks.append(chunk[0])
         made = np.concatenate(chunks)[:HORIZON]
-        rest = rest_frame(made, start=MIN_FRAMES - 1, window=WINDOW, threshold_m=THRESHOLD_M)
-        made = made if rest is None else made[: rest + 1]
+        (rest,) = rest_frames(
+            made[None],
+            start=np.array([MIN_FRAMES - 1]),
+            window=WINDOW,
+            threshold_m=THRESHOLD_M,
+        )
+        made = made if rest < 0 else made[: rest + 1]
         start = len(frames) - NUM_OBSERVED
         end = start + len(made)
-        segments.append(Segment(action=action, start=start, end=end, stopped=rest is not None))
+        segments.append(Segment(action=action, start=start, end=end, stopped=bool(rest >= 0)))
         frames = np.concatenate([frames, made])
     return frames[NUM_OBSERVED:], segments
 
@@ -206,9 +212,9 @@ def test_bundle_without_noise_repeats_its_one_future(tmp_path: Path):
 class RecordingRunner(Runner):
     calls: list[tuple[str, int]]
 
-    def run(self, role: str, tensors: Tensors, contexts: list[Context]) -> Tensors:
-        self.calls.append((role, len(contexts)))
-        return super().run(role, tensors, contexts)
+    def run(self, role: str, tensors: Tensors, parts: Sequence[Part]) -> Tensors:
+        self.calls.append((role, sum(count for _, count in parts)))
+        return super().run(role, tensors, parts)
 
 
 def test_observation_is_encoded_once_and_rows_that_turn_together_in_one_batch(

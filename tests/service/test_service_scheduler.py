@@ -61,31 +61,37 @@ def order_of_ends(scheduler: Scheduler[Some], num_requests: int) -> list[int]:
     return ended
 
 
-def test_least_work_left_has_half_of_a_turn_and_a_share_of_the_other():
+def test_least_work_left_has_the_turn_but_for_what_goes_round():
     scheduler = scheduler_of((100, 10), (100, 2), (100, 10), (100, 10), rows_per_step=16)
-    assert counts(scheduler.take()) == {1: 10, 0: 2, 2: 2, 3: 2}
+    assert [counts(scheduler.take()) for _ in range(4)] == [
+        {1: 14, 0: 2},
+        {1: 14, 2: 2},
+        {1: 14, 3: 2},
+        {1: 14, 0: 2},
+    ]
 
 
-def test_share_goes_on_where_the_turn_before_has_stopped():
+def test_a_small_turn_has_a_row_that_goes_round():
     scheduler = scheduler_of(*[(100, 10)] * 5, rows_per_step=4)
     served: Counter[int] = sum((counts(scheduler.take()) for _ in range(5)), Counter())
-    assert served == {0: 2 * 5 + 2, 1: 2, 2: 2, 3: 2, 4: 2}
+    assert served == {0: 3 * 5, 1: 2, 2: 1, 3: 1, 4: 1}
 
 
-def test_short_request_among_long_ones_runs_in_its_first_two_turns():
+def test_short_request_among_long_ones_runs_in_its_first_turn():
     scheduler = scheduler_of(*[(50, 10)] * 8, rows_per_step=64)
     settle(scheduler, scheduler.take())
     scheduler.add(8, [Some(8, 0, 50, turns_left=1)])
     first = scheduler.take()
+    assert counts(first)[8] == 50
     settle(scheduler, first)
-    assert counts(first)[8] >= 32
-    settle(scheduler, scheduler.take())
     assert scheduler.waiting(8) == ()
 
 
-def test_equal_requests_end_in_the_order_of_their_arrival():
-    scheduler = scheduler_of(*[(50, 10)] * 8, rows_per_step=64)
-    assert order_of_ends(scheduler, 8) == list(range(8))
+@pytest.mark.parametrize("rows_per_step", [32, 64, 128])
+def test_equal_requests_end_about_in_the_order_of_their_arrival(rows_per_step: int):
+    scheduler = scheduler_of(*[(50, 10)] * 8, rows_per_step=rows_per_step)
+    places = enumerate(order_of_ends(scheduler, 8))
+    assert all(abs(request_id - place) <= 1 for place, request_id in places)
 
 
 def test_tight_deadlines_go_first_the_earliest_before_the_others():
@@ -185,7 +191,7 @@ def test_every_turn_is_full_and_bounded_and_no_request_starves(requests, rows_pe
         for request_id in range(len(requests)):
             waits = request_id not in served and scheduler.waiting(request_id)
             waited[request_id] = waited[request_id] + 1 if waits else 0
-            # Half of a turn, at least one row, goes round among all requests.
+            # Some rows of a turn go round among all requests.
             assert waited[request_id] <= len(requests)
     assert sum(run.values()) == len(run) == work
 

@@ -59,6 +59,9 @@ def test_metrics_count_what_happened(fresh: Service):
     assert found["motion_queue_wait_seconds_count", "diffusion"] == 2.0
     assert found["motion_step_duration_seconds_count", "diffusion"] >= 10.0
     assert found["motion_batch_rows_count", "diffusion"] >= 10.0
+    assert found["motion_batch_dispatch_seconds_count", "diffusion"] >= 10.0
+    assert found["motion_rows_unwanted_total", "diffusion"] == 0.0
+    assert found["motion_golden_check", "diffusion"] == 1.0
     assert found["motion_encode_seconds_count", "application/json"] == 2.0
     assert found["motion_queue_requests", "diffusion"] == 0.0
     assert found["motion_queue_rows", "diffusion"] == 0.0

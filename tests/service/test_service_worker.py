@@ -16,7 +16,7 @@ from tiny_bundles import NUM_STEPS, walking
 
 from models.bundle import read_manifest
 from service.engine.context import Part, Tensors
-from service.engine.engine import Engine
+from service.engine.engine import Engine, Turn
 from service.engine.runner import Runner
 from service.engine.trajectory import Preview, Request, Result
 from service.errors import (
@@ -64,8 +64,8 @@ class Recorder:
         self.rows: list[int] = []
         self.ends: list[dict[str, Any]] = []
 
-    def stepped(self, *, rows: int, **_: Any) -> None:
-        self.rows.append(rows)
+    def stepped(self, *, turn: Turn, **_: Any) -> None:
+        self.rows.append(turn.num_rows)
 
     def ended(self, **facts: Any) -> None:
         self.ends.append(facts)

@@ -66,7 +66,7 @@ def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
 def test_frames_do_not_depend_on_how_many_follow(form):
     observed, action = drawn(2, 15, FEATURES), torch.tensor([0, 2])
     z = drawn(2, size_of_z(form))
-    state = form.begin(observed, action)
+    _, state = form.begin(observed, action)
     short, _ = form.advance(z, state, 30)
     long, _ = form.advance(z, state, 60)
     assert long.shape == (2, 60, FEATURES)
@@ -76,7 +76,7 @@ def test_frames_do_not_depend_on_how_many_follow(form):
 def test_recurrent_form_goes_on_from_what_it_carries():
     form = recurrent()
     observed, action, z = drawn(2, 15, FEATURES), torch.tensor([0, 2]), drawn(2, 4 + NUM_TIMES)
-    state = form.begin(observed, action)
+    _, state = form.begin(observed, action)
     whole, _ = form.advance(z, state, 40)
     kept = state[: len(form.kept)]
     first, carried = form.advance(z, state, 20)
@@ -111,7 +111,8 @@ def test_action_and_latent_decide_what_is_performed(form):
     z = drawn(1, size_of_z(form))
 
     def frames(action: int, latent: torch.Tensor) -> torch.Tensor:
-        return form.advance(latent, form.begin(observed, torch.tensor([action])), 20)[0]
+        _, state = form.begin(observed, torch.tensor([action]))
+        return form.advance(latent, state, 20)[0]
 
     assert not torch.allclose(frames(0, z), frames(1, z))
     assert not torch.allclose(frames(0, z), frames(0, -z))
@@ -125,7 +126,7 @@ def timing(*, length: float = 40.0, period: float = 30.0, phase: float = 0.0) ->
 @pytest.mark.parametrize("change", [{"length": 20.0}, {"period": 20.0}, {"phase": 2.0}])
 def test_timing_decides_what_is_performed(form, change):
     observed, z = drawn(1, 15, FEATURES), drawn(1, size_of_z(form) - NUM_TIMES)
-    state = form.begin(observed, torch.tensor([0]))
+    _, state = form.begin(observed, torch.tensor([0]))
     frames = [
         form.advance(torch.cat([z, times], dim=1), state, 30)[0]
         for times in (timing(), timing(**change))

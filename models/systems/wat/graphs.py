@@ -29,13 +29,10 @@ class Encoder(nn.Module):
         self, observation: Float[Tensor, "B T J 3"], action: Int[Tensor, "B"]
     ) -> tuple[Tensor, ...]:
         """The prior of z, the bones, where the person stands, and the form's own tensors."""
-        poses = self.network.poses
-        observed = poses.enter_observation(observation)
-        mean, log_variance = self.network.prior(observed, action)
-        bones = poses.bones(observation)
+        observed, bones = self.network.poses.enter_observation(observation)
+        (mean, log_variance), own = self.network.begin(observed, action)
         beginning = 1.0 + 0.0 * mean[:, :1]  # ones_like would fix the batch's size
         ground = 0.0 * bones[:, 0]  # heading, x, y
-        own = self.network.form.begin(observed, action)
         deviation = (0.5 * log_variance).exp()
         narrowed = self.spread * deviation[:, :-NUM_TIMES]
         deviation = torch.cat([narrowed, deviation[:, -NUM_TIMES:]], dim=1)

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
-from models.articulation import ArticulatedPoses
+from models.articulated_poses import ArticulatedPoses
 from models.pose import cosine_basis
 from models.system import Batch, Losses
 from models.systems.wat.recurrent import Told
-from models.systems.wat.timing import LENGTH_UNIT, NUM_TIMES, Rhythm
+from models.systems.wat.timing import LENGTH_UNIT, NUM_TIMES, Gaussian, Rhythm
 
 LOG_VARIANCE_LIMIT = 8.0
 POSTERIOR_LOG_VARIANCE = -4.0
@@ -48,15 +48,15 @@ class WAT(nn.Module):
         momentum[-4:-1] = 0.0  # turns and steps are velocities already
         self.register_buffer("momentum", momentum, persistent=False)
 
-    def prior(
+    def begin(
         self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
-    ) -> tuple[Float[Tensor, "B Z"], Float[Tensor, "B Z"]]:
-        """Mean and log variance of z given what is known when a request arrives.
+    ) -> tuple[Gaussian, tuple[Tensor, ...]]:
+        """The prior of z given what is known when a request arrives, and the form's own tensors.
 
-        The last coordinates are a timing, which is drawn like the others.
+        The last coordinates of z are a timing, which is drawn like the others.
         """
-        mean, log_variance = self.form.prior(observed, action)
-        return mean, log_variance.clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
+        (mean, log_variance), state = self.form.begin(observed, action)
+        return (mean, log_variance.clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)), state
 
     def posterior(
         self,
@@ -162,7 +162,7 @@ def _terms(
     needed = int((length + padding).max())
     num_frames = min(-(-needed // patch) * patch, batch["future"].shape[1])
     with torch.no_grad():
-        observed = network.poses.enter_observation(batch["seen"])
+        observed, _ = network.poses.enter_observation(batch["seen"])
         future = network.poses.enter(batch["observation"], batch["future"][:, :num_frames])
     frame = torch.arange(num_frames, device=first.device)
     # After a transition the first pose is known, but not the step that led to it.
@@ -170,13 +170,12 @@ def _terms(
     known = begun & (frame < (length + padding)[:, None])
     timing, sure = _timing(network, batch, performed=begun & (frame < length[:, None]))
     mean, log_variance = network.posterior(observed, future, length.clamp(max=num_frames), action)
-    expected, expected_log_variance = network.prior(observed, action)
+    (expected, expected_log_variance), state = network.begin(observed, action)
     noise = torch.randn(mean.shape, generator=generator, device=mean.device)
     z = torch.cat([mean + (0.5 * log_variance).exp() * noise, timing], dim=1)
     least, most = told
     share = least + (most - least) * _uniform(len(z), generator, z)[:, None]
     here = known & (_uniform(known.shape, generator, z) < share)
-    state = network.form.begin(observed, action)
     predicted, _ = network.form.advance(z, state, num_frames, Told(future, here))
     predicted = network.joined(predicted, observed, torch.ones_like(z[:, :1]))
     weight = network.poses.weights.sqrt()

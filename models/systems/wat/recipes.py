@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from models.articulation import ArticulatedPoses
+from models.articulated_poses import ArticulatedPoses
 from models.motion.skeleton import BODY21, SMPL22
 from models.system import Actions, Augmentation, Data, Recipe, Stage
 from models.systems.wat import objective

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from models.systems.wat.timing import NUM_TIMES, Clock
+from models.systems.wat.timing import NUM_TIMES, Clock, Gaussian
 
 
 class TanhMLP(nn.Sequential):
@@ -30,7 +30,7 @@ class Told(NamedTuple):
 class RecurrentVAE(nn.Module):
     """Encoders and decoder of gated recurrent units; a unit sees ``frames_per_step`` frames."""
 
-    kept = ("observed_code", "action_code")
+    kept = ("request",)
     """Tensors of `begin` that stay as they are while an action goes on."""
     carried = ("hidden", "latest_frame", "steps")
     """Tensors of `begin` that `advance` replaces."""
@@ -67,14 +67,6 @@ class RecurrentVAE(nn.Module):
         for parameter in self.output[-1].parameters():
             nn.init.normal_(parameter, std=1e-3)
 
-    def prior(
-        self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
-    ) -> tuple[Float[Tensor, "B Z"], Float[Tensor, "B Z"]]:
-        """Mean and log variance of z, timing included, before the future is known."""
-        joined = torch.cat([self._code(observed), self.action(action)], dim=1)
-        mean, log_variance = self.prior_network(joined).chunk(2, dim=1)
-        return mean, log_variance
-
     def posterior(
         self,
         observed: Float[Tensor, "B T F"],
@@ -92,11 +84,18 @@ class RecurrentVAE(nn.Module):
 
     def begin(
         self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
-    ) -> tuple[Tensor, ...]:
-        """What `advance` takes beside z: the tensors of ``kept``, then those of ``carried``."""
+    ) -> tuple[Gaussian, tuple[Tensor, ...]]:
+        """The prior of z, timing included, and what `advance` takes beside z.
+
+        The latter are the tensors of ``kept``, then those of ``carried``.
+        """
         code = self._code(observed)
-        steps = 0.0 * code[:, :1]
-        return code, self.action(action), self.first_hidden(code), observed[:, -1], steps
+        known = torch.cat([code, self.action(action)], dim=1)
+        mean, log_variance = self.prior_network(known).chunk(2, dim=1)
+        weight, bias = self.from_request.weight[:, : known.shape[1]], self.from_request.bias
+        request = nn.functional.linear(known, weight, bias)
+        state = (request, self.first_hidden(code), observed[:, -1], 0.0 * code[:, :1])
+        return (mean, log_variance), state
 
     def advance(
         self,
@@ -106,8 +105,11 @@ class RecurrentVAE(nn.Module):
         told: Told | None = None,
     ) -> tuple[Float[Tensor, "B L F"], tuple[Tensor, ...]]:
         """The next frames, and the tensors of ``carried`` after them."""
-        code, action, hidden, latest, steps = state
-        fixed = self.from_request(torch.cat([code, action, z[:, :-NUM_TIMES]], dim=1))
+        request, hidden, latest, steps = state
+        latent = z[:, :-NUM_TIMES]
+        fixed = request + nn.functional.linear(
+            latent, self.from_request.weight[:, -latent.shape[1] :]
+        )
         patches = []
         for start in range(0, num_frames, self.frames_per_step):
             clock = self.from_clock(self.clock(steps, z[:, -NUM_TIMES:]))

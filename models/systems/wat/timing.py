@@ -6,6 +6,7 @@ the last coordinates of z.
 """
 
 import math
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,6 +28,9 @@ NUM_RATES = 8
 """Sines and cosines of periods 4 to 512 steps tell age and time left."""
 LEFT_AT_REST = -1.0
 """Steps left that stay as they are: all of standing still is alike."""
+
+Gaussian: TypeAlias = tuple[Float[Tensor, "B Z"], Float[Tensor, "B Z"]]
+"""Mean and log variance of z, whose last coordinates are a timing."""
 
 
 class Clock(nn.Module):

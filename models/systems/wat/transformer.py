@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from models.systems.wat.timing import NUM_TIMES, Clock
+from models.systems.wat.timing import NUM_TIMES, Clock, Gaussian
 
 
 class Layer(nn.Module):
@@ -150,16 +150,6 @@ class TransformerVAE(nn.Module):
         condition = torch.ones(tokens, 2, dtype=torch.bool)
         self.register_buffer("may_see", torch.cat([condition, seen], dim=1), persistent=False)
 
-    def prior(
-        self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
-    ) -> tuple[Float[Tensor, "B Z"], Float[Tensor, "B Z"]]:
-        """Mean and log variance of z, timing included, before the future is known."""
-        everything = self.may_see[None, -1:, : 2 + self.num_observed]
-        summary = self.prior_summary(action)
-        mean, log_variance = self._summarised(self.prior_stack, summary, observed, everything)
-        time, time_log_variance = self.timing(mean).chunk(2, dim=1)
-        return torch.cat([mean, time], 1), torch.cat([log_variance, time_log_variance], 1)
-
     def posterior(
         self,
         observed: Float[Tensor, "B T F"],
@@ -178,9 +168,14 @@ class TransformerVAE(nn.Module):
 
     def begin(
         self, observed: Float[Tensor, "B T F"], action: Int[Tensor, "B"]
-    ) -> tuple[Tensor, ...]:
-        """What `advance` takes beside z: the tensors of ``kept``."""
-        return observed, self.action(action)
+    ) -> tuple[Gaussian, tuple[Tensor, ...]]:
+        """The prior of z, timing included, and what `advance` takes beside z: ``kept``."""
+        everything = self.may_see[None, -1:, : 2 + self.num_observed]
+        summary = self.prior_summary(action)
+        mean, log_variance = self._summarised(self.prior_stack, summary, observed, everything)
+        time, time_log_variance = self.timing(mean).chunk(2, dim=1)
+        prior = torch.cat([mean, time], 1), torch.cat([log_variance, time_log_variance], 1)
+        return prior, (observed, self.action(action))
 
     def advance(
         self,
