@@ -50,7 +50,7 @@ def apd(samples: Samples) -> PerItem:
 
 
 def apd_of_largest(samples: Samples, *, pairs: int = 50) -> PerItem:
-    """`apd` over the farthest pairs of samples alone, as MotionDiff reports it (Wei et al. 2023).
+    """`apd` over the farthest pairs of samples alone, which some report as the APD (Wei et al. 2023).
 
     Over 50 of the 1225 pairs of 50 samples it is far above `apd`; never compare the two.
     """
@@ -58,9 +58,9 @@ def apd_of_largest(samples: Samples, *, pairs: int = 50) -> PerItem:
     first, second = np.triu_indices(samples.shape[1], k=1)
     if not len(first):
         return np.zeros(len(samples))
-    distances = np.stack([
-        np.linalg.norm(item[first] - item[second], axis=-1) for item in sequences
-    ])
+    distances = np.stack(
+        [np.linalg.norm(item[first] - item[second], axis=-1) for item in sequences]
+    )
     return np.asarray(np.sort(distances, axis=1)[:, -pairs:].mean(axis=1))
 
 

@@ -160,7 +160,8 @@ H36M17_FROM_BODY21: Mapping[str, Weights] = {
 } | {h36m: {body21: 1.0} for h36m, body21 in _H36M_LIMBS.items()}
 
 # HumanEva's limbs are named as Human3.6M's; between pelvis and thorax it has no joint.
-BODY21_FROM_HUMANEVA15: Mapping[str, Weights] = BODY21_FROM_H36M17 | {
+BODY21_FROM_HUMANEVA15: Mapping[str, Weights] = {
+    **BODY21_FROM_H36M17,
     "hips": {"Pelvis": 0.956, "Thorax": 0.044},
     "spine": {"Pelvis": 0.765, "Thorax": 0.235},
     "chest": {"Pelvis": 0.31, "Thorax": 0.69},
