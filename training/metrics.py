@@ -50,7 +50,7 @@ def apd(samples: Samples) -> PerItem:
 
 
 def apd_of_largest(samples: Samples, *, pairs: int = 50) -> PerItem:
-    """`apd` over the farthest pairs of samples alone, which some report as the APD (Wei et al. 2023).
+    """`apd` over the farthest pairs of samples, which Wei et al. 2023 report as the APD.
 
     Over 50 of the 1225 pairs of 50 samples it is far above `apd`; never compare the two.
     """

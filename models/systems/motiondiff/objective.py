@@ -208,7 +208,7 @@ def refinement_loss(  # noqa: PLR0913 - the symbols of Eq. 10
         "reconstruction": reconstruction,
         "unrefined": best_of(samples, future, exponent=exponent),
         "diversity": diversity,
-        "undiversity": closeness(samples, sigma=sigma),
+        "unrefined_diversity": closeness(samples, sigma=sigma),
     }
 
 

@@ -15,7 +15,7 @@ from models.systems.motiondiff.objective import MotionDiff
 from models.systems.motiondiff.refiner import Refiner, batch_norm, layer_norm
 
 NUM_STEPS = 100
-DEFAULT_STEPS = 10
+STEPS = 10
 GAMMA = 0.1
 EVERYTHING = {"bandai": 0.5, "cmu": 0.45, "hdm05": 0.05}
 
@@ -137,7 +137,7 @@ def build_paper(*, data: Data, sizes: PaperSizes) -> MotionDiff:
 def mocap(
     *,
     hold_out: tuple[str, ...] = (),
-    updates: tuple[int, int] = (9_000, 3_000),
+    updates: tuple[int, int] = (9_000, 900),
 ) -> Recipe:
     """Ours: 30 fps, half a second to two seconds, world trajectory, on public motion capture."""
     data = Data(
@@ -294,7 +294,7 @@ def _paper_recipe(
         graphs=graphs,
         schedule=schedule,
         plan="stride",
-        default_steps=DEFAULT_STEPS,
+        default_steps=STEPS,
         x_t_shape=(data.horizon, data.skeleton.num_joints - 1, 3),
         trajectory="root-relative",
         symmetries=("translation",),
@@ -314,7 +314,7 @@ def _paper_recipe(
                     objective.refinement_loss,
                     schedule=schedule,
                     num_samples=samples,
-                    num_steps=DEFAULT_STEPS,
+                    num_steps=STEPS,
                     sigma=1e5,
                     reconstruction_weight=200 / 1e5,
                     diversity_weight=1.0,
@@ -350,7 +350,7 @@ def _keyframe_recipe(
         graphs=graphs,
         schedule=schedule,
         plan="stride",
-        default_steps=DEFAULT_STEPS,
+        default_steps=STEPS,
         x_t_shape=(sizes.num_frames, data.skeleton.num_joints, 3),
         stages=(
             Stage(
@@ -375,10 +375,10 @@ def _keyframe_recipe(
                     objective.refinement_loss,
                     schedule=schedule,
                     num_samples=samples,
-                    num_steps=DEFAULT_STEPS,
+                    num_steps=STEPS,
                     sigma=20.0,
                     reconstruction_weight=1.0,
-                    diversity_weight=10.0,
+                    diversity_weight=5.0,
                     exponent=1.0,
                     root_weight=0.5,
                 ),

@@ -1,6 +1,7 @@
 """The refinement: graph convolutions over the DCT of a whole motion (Mao et al. 2019, LTD-GCN)."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -83,10 +84,10 @@ class Refiner(nn.Module):
         basis = cosine_basis(coefficients, num_observed + horizon)
         self.register_buffer("basis", basis, persistent=False)
         self.coefficients = Affine(features * coefficients)
-        sizes = {"nodes": features, "norm": norm, "dropout": dropout}
-        self.first = _Convolved(coefficients, hidden, **sizes)
+        convolved = partial(_Convolved, nodes=features, norm=norm, dropout=dropout)
+        self.first = convolved(coefficients, hidden)
         self.blocks = nn.ModuleList(
-            nn.Sequential(_Convolved(hidden, hidden, **sizes), _Convolved(hidden, hidden, **sizes))
+            nn.Sequential(convolved(hidden, hidden), convolved(hidden, hidden))
             for _ in range(blocks)
         )
         self.last = GraphConvolution(hidden, coefficients, nodes=features)

@@ -1,5 +1,7 @@
 """The Transformer layer that both forms are made of."""
 
+from collections.abc import Sequence
+
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -27,12 +29,11 @@ class Layer(nn.Module):
         self, x: Float[Tensor, "B S W"], condition: Float[Tensor, "B P"] | None = None
     ) -> Float[Tensor, "B S W"]:
         """The tokens after attention and feed-forward."""
-        first = second = (0.0, 0.0)
+        parts: Sequence[Tensor | float] = (0.0,) * 4
         if condition is not None:
             parts = condition[:, None].chunk(4, dim=-1)
-            first, second = (parts[0], parts[1]), (parts[2], parts[3])
-        x = x + self.dropout(self._attended(self.norms[0](x) * (1 + first[0]) + first[1]))
-        h = self.norms[1](x) * (1 + second[0]) + second[1]
+        x = x + self.dropout(self._attended(self.norms[0](x) * (1 + parts[0]) + parts[1]))
+        h = self.norms[1](x) * (1 + parts[2]) + parts[3]
         result: Tensor = x + self.dropout(self.feed_forward(h))
         return result
 
