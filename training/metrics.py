@@ -58,7 +58,7 @@ def mean_over_pairs(distances: Float[np.ndarray, "B S S"]) -> PerItem:
 
 
 def apd_of_largest(samples: Samples, *, pairs: int = 50) -> PerItem:
-    """`apd` over the farthest pairs of samples alone, as MotionDiff reports it (Wei et al. 2023).
+    """`apd` over the farthest pairs of samples, which Wei et al. 2023 report as the APD.
 
     Over 50 of the 1225 pairs of 50 samples it is far above `apd`; never compare the two.
     """
