@@ -101,6 +101,108 @@ export type AxesBody = {
 };
 
 /**
+ * BoxBody
+ *
+ * A box in the caller's axes and units, half of its size to each side of its centre.
+ */
+export type BoxBody = {
+    /**
+     * Center
+     */
+    center: [
+        number,
+        number,
+        number
+    ];
+    /**
+     * Size
+     *
+     * along its own x, y and z, which are the caller's where yaw is 0
+     */
+    size: [
+        number,
+        number,
+        number
+    ];
+    /**
+     * Yaw
+     *
+     * radians about up
+     */
+    yaw?: number;
+};
+
+/**
+ * CapsuleBody
+ *
+ * All within a radius of a line, in the caller's axes and units; a ball if its ends are one.
+ */
+export type CapsuleBody = {
+    /**
+     * Start
+     */
+    start: [
+        number,
+        number,
+        number
+    ];
+    /**
+     * End
+     */
+    end: [
+        number,
+        number,
+        number
+    ];
+    /**
+     * Radius
+     */
+    radius: number;
+};
+
+/**
+ * Distance
+ *
+ * How near futures come to a region.
+ */
+export type Distance = {
+    /**
+     * Levels
+     */
+    levels: Array<number>;
+    /**
+     * Distance
+     *
+     * in the caller's units; 0 is within
+     */
+    distance: Array<number>;
+};
+
+/**
+ * Entry
+ *
+ * When futures enter a region for the first time.
+ */
+export type Entry = {
+    /**
+     * Never
+     *
+     * share of the futures that do not
+     */
+    never: number;
+    /**
+     * Levels
+     */
+    levels: Array<number>;
+    /**
+     * Time S
+     *
+     * from now: by then this share of all futures has; null where fewer ever do
+     */
+    time_s: Array<number | null>;
+};
+
+/**
  * FileObservation
  *
  * The motion of a file, in the fields of a request, and what is worth knowing of it.
@@ -319,6 +421,14 @@ export type ModelDetail = {
      */
     num_steps?: number | null;
     /**
+     * Default Steps
+     */
+    default_steps?: number | null;
+    /**
+     * Step Plan
+     */
+    step_plan?: 'stop_early' | 'stride' | null;
+    /**
      * Trajectory
      */
     trajectory?: string | null;
@@ -431,6 +541,14 @@ export type ModelSummary = {
      */
     num_steps?: number | null;
     /**
+     * Default Steps
+     */
+    default_steps?: number | null;
+    /**
+     * Step Plan
+     */
+    step_plan?: 'stop_early' | 'stride' | null;
+    /**
      * Trajectory
      */
     trajectory?: string | null;
@@ -508,6 +626,52 @@ export type ObservedPoses = {
      * a name of GET /models
      */
     model?: string | null;
+};
+
+/**
+ * Occupancy
+ *
+ * What the futures say of one region; shares of samples, which no measurement has widened.
+ */
+export type Occupancy = {
+    /**
+     * Probability
+     *
+     * [frames]: of those that last so long, in it then
+     */
+    probability: Array<unknown>;
+    /**
+     * Num Lasting
+     *
+     * [frames]: how many futures last so long
+     */
+    num_lasting: Array<number>;
+    first_entry: Entry;
+    min_distance: Distance;
+};
+
+/**
+ * OccupancyBody
+ *
+ * Where a robot is or will be, and how near is too near.
+ */
+export type OccupancyBody = {
+    /**
+     * Regions
+     */
+    regions: Array<RegionBody>;
+    /**
+     * Margin M
+     *
+     * metres: a joint or bone, which has no width, that is at most so far from a region is in it
+     */
+    margin_m?: number;
+    /**
+     * Levels
+     *
+     * of the quantiles
+     */
+    levels?: Array<number>;
 };
 
 /**
@@ -611,6 +775,10 @@ export type PredictActionsRequest = {
      */
     deadline_ms?: number | null;
     /**
+     * regions to watch, where `return` names occupancy
+     */
+    occupancy?: OccupancyBody | null;
+    /**
      * Actions
      *
      * labels of GET /actions, performed one after the other
@@ -628,6 +796,12 @@ export type PredictActionsRequest = {
      * an action that has not ended by then is cut off; at most, and by default, the model's horizon
      */
     max_seconds_per_action?: number | null;
+    /**
+     * Return
+     *
+     * parts of the answer
+     */
+    return?: Array<'futures' | 'occupancy'>;
 };
 
 /**
@@ -676,7 +850,13 @@ export type PredictActionsResponse = {
     /**
      * Futures
      */
-    futures: Array<PerformedFuture>;
+    futures?: Array<PerformedFuture> | null;
+    /**
+     * Occupancy
+     *
+     * of each region
+     */
+    occupancy?: Array<Occupancy> | null;
 };
 
 /**
@@ -754,9 +934,13 @@ export type PredictRequest = {
      */
     deadline_ms?: number | null;
     /**
+     * regions to watch, where `return` names occupancy
+     */
+    occupancy?: OccupancyBody | null;
+    /**
      * Num Steps
      *
-     * stop after so many of the model's denoising steps
+     * so many of the model's denoising steps: the first, or, as its `step_plan` says, an even stride over all; its `default_steps` by default
      */
     num_steps?: number | null;
     /**
@@ -776,7 +960,7 @@ export type PredictRequest = {
      *
      * parts of the answer
      */
-    return?: Array<'futures' | 'modes' | 'quantiles'>;
+    return?: Array<'futures' | 'modes' | 'quantiles' | 'occupancy'>;
     /**
      * Num Modes
      *
@@ -855,6 +1039,12 @@ export type PredictResponse = {
      */
     modes?: Array<Mode> | null;
     quantiles?: Quantiles | null;
+    /**
+     * Occupancy
+     *
+     * of each region
+     */
+    occupancy?: Array<Occupancy> | null;
     steps: Steps;
 };
 
@@ -962,6 +1152,16 @@ export type Ready = {
     golden_digests: {
         [key: string]: string;
     };
+};
+
+/**
+ * RegionBody
+ *
+ * A box or a capsule.
+ */
+export type RegionBody = {
+    box?: BoxBody | null;
+    capsule?: CapsuleBody | null;
 };
 
 /**

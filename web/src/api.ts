@@ -105,10 +105,11 @@ export async function predictInSteps(
 export async function predictActions(body: PredictActionsRequest, axes: Axes): Promise<Answer> {
   const started = performance.now();
   const found = await told(api.predictActions({ body }));
+  const futures = found.futures ?? [];
   return {
     ...about(found, started),
-    futures: found.futures.map(({ poses }) => trackOf(poses as Poses, axes)),
-    segments: found.futures.map(({ segments }) => segments),
+    futures: futures.map(({ poses }) => trackOf(poses as Poses, axes)),
+    segments: futures.map(({ segments }) => segments),
     modes: [],
     regions: null,
     steps: null,
