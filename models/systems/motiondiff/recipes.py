@@ -137,7 +137,7 @@ def build_paper(*, data: Data, sizes: PaperSizes) -> MotionDiff:
 def mocap(
     *,
     hold_out: tuple[str, ...] = (),
-    updates: tuple[int, int] = (9_000, 900),
+    updates: tuple[int, int] = (9_000, 600),
 ) -> Recipe:
     """Ours: 30 fps, half a second to two seconds, world trajectory, on public motion capture."""
     data = Data(
@@ -378,7 +378,7 @@ def _keyframe_recipe(
                     num_steps=STEPS,
                     sigma=20.0,
                     reconstruction_weight=1.0,
-                    diversity_weight=5.0,
+                    diversity_weight=8.0,
                     exponent=1.0,
                     root_weight=0.5,
                 ),
