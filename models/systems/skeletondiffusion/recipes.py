@@ -25,6 +25,7 @@ from models.systems.skeletondiffusion.noise import (
 from models.systems.skeletondiffusion.objective import SkeletonDiffusion
 
 NUM_STEPS = 10
+DEFAULT_STEPS = 3  # the knee of the curve on `valid`
 EVERYTHING = {"bandai": 0.5, "cmu": 0.45, "hdm05": 0.05}
 HELD_OUT = (
     "style=tired",
@@ -205,6 +206,7 @@ def _recipe(
         graphs=graphs,
         schedule=schedule,
         x_t_shape=(data.skeleton.num_joints, sizes.latent),
+        default_steps=DEFAULT_STEPS,
         stages=stages,
     )
 
@@ -235,6 +237,13 @@ def mocap_held_out() -> Recipe:
     Goes on from a finished `mocap_autoencoder`.
     """
     return _held_out("mocap_held_out", _schedule(with_root(BODY21), falling))
+
+
+def mocap_longer() -> Recipe:
+    """What ships: a finished `mocap_held_out` goes on, latents kept."""
+    recipe = mocap_held_out()
+    denoiser = dataclasses.replace(recipe.stages[-1], prepare=None, learning_rate=8e-4)
+    return dataclasses.replace(recipe, name="mocap_longer", stages=(denoiser,))
 
 
 def mocap_isotropic() -> Recipe:
