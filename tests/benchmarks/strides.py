@@ -1,6 +1,6 @@
 """Strided steps through the engine against all steps of the paper's sizes in PyTorch eager.
 
-``PYTHONPATH=tests python -m benchmarks.strides`` prints it. A step of the baseline takes seconds, so
+``PYTHONPATH=tests python -m benchmarks.strides`` prints it. A step of the baseline takes seconds:
 a few of its hundred are timed, and the others taken to be like them.
 """
 
