@@ -10,7 +10,13 @@ from tiny_bundles import walking
 from typer.testing import CliRunner, Result
 
 from models.motion.formats.bvh import read_bvh, write_bvh
-from models.motion.kinematics import bone_lengths
+from models.motion.formats.files import read_motion
+from models.motion.kinematics import (
+    bone_lengths,
+    forward_kinematics,
+    inverse_kinematics,
+    rest_pose,
+)
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21
 from service.app import create_app
@@ -26,7 +32,11 @@ def environment(bundles: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def walk(tmp_path: Path) -> Path:
     file = tmp_path / "walk.bvh"
-    write_bvh(file, Motion(name="walk", skeleton=BODY21, positions=walking(40), fps=30.0))
+    poses, parents = walking(40), BODY21.parents
+    rest = rest_pose(poses, BODY21)  # nothing but rotations, as in most files
+    rotations = inverse_kinematics(poses, rest, parents)
+    rigid = forward_kinematics(rotations, rest, parents, poses[:, 0])
+    write_bvh(file, Motion(name="walk", skeleton=BODY21, positions=rigid, fps=30.0))
     return file
 
 
@@ -42,6 +52,12 @@ def run(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
+def body(path: Path) -> np.ndarray:
+    """(T, 21, 3) metres: the joints of body21 in a file that may have others too."""
+    motion = read_bvh(path)
+    return motion.positions[:, [motion.skeleton.index(joint) for joint in BODY21.joints]]
+
+
 def one_line(result: Result) -> str:
     assert result.exit_code == 2, result.output
     assert result.stderr.count("\n") == 1
@@ -54,13 +70,12 @@ def test_predict_writes_bvh_in_the_skeleton_and_rate_of_the_file(walk: Path, tmp
     assert result.exit_code == 0, result.output
     written = sorted((tmp_path / "out").glob("*.bvh"))
     assert [path.name for path in written] == [f"walk-future-{i}.bvh" for i in range(3)]
-    observed, future = read_bvh(walk), read_bvh(written[0])
-    assert future.skeleton.joints == observed.skeleton.joints
-    assert future.fps == pytest.approx(30.0)
-    assert future.num_frames == 60
-    assert np.abs(future.positions[0] - observed.positions[-1]).max() < 0.1
-    lengths = bone_lengths(future.positions, BODY21.parents)
-    expected = bone_lengths(observed.positions[-1], BODY21.parents)
+    assert read_bvh(written[0]).fps == pytest.approx(30.0)
+    observed, future = body(walk), body(written[0])
+    assert len(future) == 60
+    assert np.abs(future[0] - observed[-1]).max() < 0.1
+    lengths = bone_lengths(future, BODY21.parents)
+    expected = bone_lengths(observed[-1], BODY21.parents)
     np.testing.assert_allclose(lengths, np.broadcast_to(expected, lengths.shape), atol=1e-3)
 
 
@@ -92,7 +107,7 @@ def test_actions_are_written_each_as_long_as_it_took(walk: Path, tmp_path: Path)
     assert futures.shape == (4, lengths.max(), 21, 3)
     assert len(set(lengths)) > 1
     for i, length in enumerate(lengths):
-        written = read_bvh(tmp_path / f"walk-future-{i}.bvh").positions
+        written = body(tmp_path / f"walk-future-{i}.bvh")
         np.testing.assert_allclose(written, futures[i, :length], atol=1e-3)
         assert np.all(futures[i, length:] == futures[i, length - 1])
 
@@ -229,6 +244,41 @@ def test_models_are_listed_with_the_default_marked():
     assert lines[1].startswith("  still")
 
 
+@pytest.mark.parametrize("suffix", ["bvh", "json", "npz"])
+def test_convert_keeps_the_motion(walk: Path, tmp_path: Path, suffix: str):
+    out = tmp_path / f"out.{suffix}"
+    result = run("convert", walk, out)
+    assert result.exit_code == 0, result.output
+    assert "40 frames of 21 joints at 30 frames a second" in result.output
+    before, after = read_motion(walk), read_motion(out)
+    order = [after.skeleton.index(joint) for joint in before.skeleton.joints]
+    np.testing.assert_allclose(after.positions[:, order], before.positions, atol=1e-4)
+    assert after.fps == pytest.approx(before.fps)
+
+
+def test_convert_puts_a_motion_on_another_skeleton_at_another_rate(walk: Path, tmp_path: Path):
+    out = tmp_path / "out.npz"
+    assert run("convert", walk, out, "--skeleton", "mixamo", "--fps", "60").exit_code == 0
+    motion = read_motion(out)
+    assert (motion.skeleton.joints[0], motion.fps) == ("mixamorig:Hips", 60.0)
+    np.testing.assert_allclose(motion.positions[::2, 0], read_motion(walk).positions[:, 0],
+                               atol=1e-4)  # fmt: skip
+
+
+def test_convert_says_what_is_wrong_in_one_line(walk: Path, tmp_path: Path):
+    assert "'.fbx'; it must be one of .bvh, .glb" in one_line(run("convert", walk, "x.fbx"))
+    assert "'octopus'" in one_line(run("convert", walk, "x.bvh", "--skeleton", "octopus"))
+    assert "No such file" in one_line(run("convert", tmp_path / "no.bvh", "x.bvh"))
+
+
+@pytest.mark.parametrize("suffix", ["glb", "json"])
+def test_predict_writes_other_files_too(walk: Path, tmp_path: Path, suffix: str):
+    options = ("--num-samples", "2", "--seed", "1", "--format", suffix, "--out", tmp_path / "out")
+    assert run("predict", walk, *options).exit_code == 0
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert written == [f"walk-future-{i}.{suffix}" for i in range(2)]
+
+
 def test_flags_are_frozen():
     commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     flags = {name: [p.name for p in command.params] for name, command in commands.items()}
@@ -241,4 +291,5 @@ def test_flags_are_frozen():
             "num_modes", "model", "seed", "out", "output_format", "at",
             "actions", "stop_threshold", "max_seconds_per_action", "url", "stream",
         ],
+        "convert": ["file", "out", "skeleton", "fps"],
     }  # fmt: skip

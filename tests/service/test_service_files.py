@@ -61,7 +61,8 @@ def test_part_of_a_fast_file_is_cut_and_slowed(service: Service):
 
 def test_observation_comes_as_messagepack_too(service: Service):
     response = sent(service, bvh(walk()), accept=MSGPACK)
-    assert decoded(response.content, MSGPACK, limit=10**9)["poses"].shape == (60, 21, 3)
+    answer = decoded(response.content, MSGPACK, limit=10**9)
+    assert answer["poses"].shape == (60, len(answer["parents"]), 3)
 
 
 def test_archive_of_one_clip_is_a_file_too(service: Service, tmp_path: Path):
@@ -70,6 +71,17 @@ def test_archive_of_one_clip_is_a_file_too(service: Service, tmp_path: Path):
         sent(service, (tmp_path / "walk.npz").read_bytes(), name="walk.npz").content
     )
     np.testing.assert_allclose(answer["poses"], walking(60), atol=2e-4)
+
+
+def test_frames_of_openpose_come_in_a_zip_and_what_was_not_seen_is_null(service: Service):
+    values = np.ones((25, 4))
+    values[:, :3] = np.random.default_rng(0).uniform(-1, 1, (25, 3))
+    values[7] = 0.0
+    frame = orjson.dumps({"people": [{"pose_keypoints_3d": values.ravel().tolist()}]})
+    content = zipped(**{f"x{i}_json": frame for i in range(3)})
+    answer = orjson.loads(sent(service, content, name="x.zip").content)
+    wrist = answer["skeleton"]["joints"].index("LWrist")
+    assert [pose.index(None) for pose in answer["poses"]] == [wrist] * 3
 
 
 @pytest.mark.skipif(not SAMPLES.is_dir(), reason=f"no sample files in {SAMPLES}")

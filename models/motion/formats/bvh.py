@@ -129,9 +129,9 @@ def _positions(
 def write_bvh(
     path_or_file: Path | TextIOBase, motion: Motion, *, tolerance_m: float = 8e-5
 ) -> None:
-    """Writes a motion so that `read_bvh` finds its positions again, by default to 0.1 mm.
+    """Writes the `rig` of a motion, so that `read_bvh` finds its positions again, to 0.1 mm.
 
-    Rotations are those of its `rig`; joints that move there get position channels as well.
+    Joints that move get position channels, and the OFFSET 0: some tools add the two.
     """
     if isinstance(path_or_file, Path):
         with path_or_file.open("w", encoding="utf-8") as file:
@@ -139,35 +139,35 @@ def write_bvh(
         return
     rig = rigged(motion, tolerance_m=tolerance_m)
     columns: list[Float[np.ndarray, "T C"]] = []
-    for j in _depth_first(motion):
+    for j in _depth_first(rig):
         if rig.moving[j]:
             columns.append(rig.translations[:, j][:, [1, 2, 0]] * 100.0)
         angles = rot.to_euler(rig.rotations[:, j][:, [0, 2, 3, 1]], _ORDER)
         columns.append(np.degrees(np.unwrap(angles, axis=0)))
     path_or_file.write("HIERARCHY\n")
-    path_or_file.writelines(f"{line}\n" for line in _joint_lines(motion, rig, 0, 0))
+    path_or_file.writelines(f"{line}\n" for line in _joint_lines(rig, 0, 0))
     path_or_file.write(f"MOTION\nFrames: {motion.num_frames}\n")
     path_or_file.write(f"Frame Time: {1.0 / motion.fps:.9f}\n")
     np.savetxt(path_or_file, np.concatenate(columns, axis=1), fmt="%.6f")
 
 
-def _depth_first(motion: Motion, joint: int = 0) -> Iterator[int]:
+def _depth_first(rig: Rig, joint: int = 0) -> Iterator[int]:
     yield joint
-    for child in motion.skeleton.children[joint]:
-        yield from _depth_first(motion, child)
+    for child in rig.children[joint]:
+        yield from _depth_first(rig, child)
 
 
-def _joint_lines(motion: Motion, rig: Rig, joint: int, depth: int) -> Iterator[str]:
+def _joint_lines(rig: Rig, joint: int, depth: int) -> Iterator[str]:
     indent = "  " * depth
-    x, y, z = rig.rest[joint, [1, 2, 0]] * (100.0 if joint else 0.0)
+    x, y, z = np.where(rig.moving[joint], 0.0, 100.0 * rig.rest[joint, [1, 2, 0]])
     channels = f"6 {_POSITION_CHANNELS}" if rig.moving[joint] else "3"
-    yield f"{indent}{'JOINT' if joint else 'ROOT'} {motion.skeleton.joints[joint]}"
+    yield f"{indent}{'JOINT' if joint else 'ROOT'} {rig.joints[joint]}"
     yield f"{indent}{{"
     yield f"{indent}  OFFSET {x:.6f} {y:.6f} {z:.6f}"
     yield f"{indent}  CHANNELS {channels} {_ROTATION_CHANNELS}"
-    children = motion.skeleton.children[joint]
+    children = rig.children[joint]
     for child in children:
-        yield from _joint_lines(motion, rig, child, depth + 1)
+        yield from _joint_lines(rig, child, depth + 1)
     if not children:
         tip = f"{_TIP * x:.6f} {_TIP * y:.6f} {_TIP * z:.6f}"
         yield from (f"{indent}  End Site", f"{indent}  {{", f"{indent}    OFFSET {tip}")

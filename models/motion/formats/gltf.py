@@ -72,8 +72,8 @@ def write_glb(path_or_file: Path | BufferedIOBase, motion: Motion) -> None:
     document = {
         "asset": {"version": "2.0", "generator": "posefutures"},
         "scene": 0,
-        "scenes": [{"nodes": [0, motion.skeleton.num_joints]}],
-        "nodes": [*_nodes(motion, rig), {"name": motion.name, "mesh": 0, "skin": 0}],
+        "scenes": [{"nodes": [0, len(rig.joints)]}],
+        "nodes": [*_nodes(rig), {"name": motion.name, "mesh": 0, "skin": 0}],
         "meshes": [{"name": motion.name, "primitives": [_body(motion, rig, buffer)]}],
         "materials": [
             {
@@ -85,7 +85,7 @@ def write_glb(path_or_file: Path | BufferedIOBase, motion: Motion) -> None:
                 },
             }
         ],
-        "skins": [_skin(motion, rig, buffer)],
+        "skins": [_skin(rig, buffer)],
         "animations": [_animation(motion, rig, buffer)],
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
@@ -104,40 +104,40 @@ def _turned(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 
     return points[..., [1, 2, 0]]
 
 
-def _nodes(motion: Motion, rig: Rig) -> list[dict[str, Any]]:
+def _nodes(rig: Rig) -> list[dict[str, Any]]:
     places = _turned(rig.rest)
     places[0] = _turned(rig.translations[0, 0])
     nodes: list[dict[str, Any]] = []
-    for joint, children in enumerate(motion.skeleton.children):
-        node = {"name": motion.skeleton.joints[joint], "translation": places[joint].tolist()}
+    for joint, children in enumerate(rig.children):
+        node = {"name": rig.joints[joint], "translation": places[joint].tolist()}
         nodes.append(node | {"children": list(children)} if children else node)
     return nodes
 
 
-def _rest_positions(motion: Motion, rig: Rig) -> Float[np.ndarray, "J 3"]:
+def _rest_positions(rig: Rig) -> Float[np.ndarray, "J 3"]:
     """Joints of the rest pose with the root at the origin, in glTF's axes."""
     places = np.zeros_like(rig.rest)
-    for joint, parent in enumerate(motion.skeleton.parents):
+    for joint, parent in enumerate(rig.parents):
         if parent >= 0:
             places[joint] = places[parent] + rig.rest[joint]
     return _turned(places)
 
 
-def _skin(motion: Motion, rig: Rig, buffer: _Buffer) -> dict[str, Any]:
-    inverse = np.tile(np.eye(4, dtype=np.float32), (motion.skeleton.num_joints, 1, 1))
-    inverse[:, 3, :3] = -_rest_positions(motion, rig)  # column-major
-    joints = list(range(motion.skeleton.num_joints))
+def _skin(rig: Rig, buffer: _Buffer) -> dict[str, Any]:
+    inverse = np.tile(np.eye(4, dtype=np.float32), (len(rig.joints), 1, 1))
+    inverse[:, 3, :3] = -_rest_positions(rig)  # column-major
+    joints = list(range(len(rig.joints)))
     matrices = buffer.add(inverse.reshape(-1, 16))
     return {"joints": joints, "skeleton": 0, "inverseBindMatrices": matrices}
 
 
 def _body(motion: Motion, rig: Rig, buffer: _Buffer) -> dict[str, Any]:
     """An octahedron for each bone, whose tip follows the child and whose rest the parent."""
-    places = _rest_positions(motion, rig)
+    places = _rest_positions(rig)
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     followed: list[list[int]] = []
-    for joint, parent in enumerate(motion.skeleton.parents):
+    for joint, parent in enumerate(rig.parents):
         bone = places[joint] - places[parent]
         length = float(np.linalg.norm(bone))
         if parent < 0 or length < 1e-4:
@@ -179,7 +179,7 @@ def _animation(motion: Motion, rig: Rig, buffer: _Buffer) -> dict[str, Any]:
         output = buffer.add(np.ascontiguousarray(values))
         samplers.append({"input": times, "interpolation": "LINEAR", "output": output})
 
-    for joint in range(motion.skeleton.num_joints):
+    for joint in range(len(rig.joints)):
         animate(joint, "rotation", quaternions[:, joint])
         if rig.moving[joint]:
             places = _turned(rig.translations[:, joint]).astype(np.float32)

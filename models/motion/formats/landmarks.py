@@ -73,10 +73,10 @@ def _frames(content: object) -> Sequence[_Frame]:
 def _mediapipe(frame: _Frame) -> Any:
     """x, y, z and visibility of each landmark of the first person; None where there is nobody."""
     found: Any = next((frame[key] for key in LANDMARKS if frame.get(key)), None)
-    if found is not None and isinstance(found[0], list):
-        found = found[0]
-    if not found:
+    if not isinstance(found, list):
         return None
+    if isinstance(found[0], list):
+        found = found[0]
     return [
         [joint.get("x"), joint.get("y"), joint.get("z"), joint.get("visibility", 1.0)]
         for joint in found

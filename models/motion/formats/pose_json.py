@@ -167,15 +167,20 @@ def _timed(
     positions: Float[np.ndarray, "T J 3"], content: Mapping[str, Any], path: Path
 ) -> tuple[Float[np.ndarray, "T J 3"], float]:
     """The positions at the rate that the file tells, or at that of most of its times."""
-    fps = content.get("fps")
     try:
         times = np.array(content.get("timestamps") or [], dtype=np.float64)
-        rate = float(fps) if fps is not None else even_rate(times) if len(times) > 1 else 30.0
+        asked = None if content.get("fps") is None else float(content["fps"])
     except (TypeError, ValueError) as error:
         raise MalformedFileError(path.name, found=str(error), right="must be numbers") from error
-    rising = len(times) == len(positions) and bool((np.diff(times) > 0).all())
-    if not 0.0 < rate < 1e4 or (len(times) and not rising):
+    if times.size and not (times.shape == positions.shape[:1] and (np.diff(times) > 0).all()):
         raise InvalidNumberError(
-            path.name, found=f"{rate} frames a second", right="times must rise, one for each frame"
+            f"{path.name}: timestamps",
+            found=f"{times.size} times",
+            right="there must be one for each frame, and times must rise",
         )
-    return (at_even_times(positions, times, rate) if len(times) > 1 else positions), rate
+    rate = asked or (even_rate(times) if times.size > 1 else 30.0)
+    if asked == 0.0 or not 0.0 < rate < 1e4:
+        raise InvalidNumberError(
+            path.name, found=f"{asked} frames a second", right="it must be positive"
+        )
+    return (at_even_times(positions, times, rate) if times.size > 1 else positions), rate

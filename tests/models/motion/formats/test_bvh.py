@@ -2,6 +2,7 @@ import io
 from pathlib import Path
 
 import numpy as np
+import pybvh
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -19,7 +20,7 @@ from models.motion.formats.errors import (
 )
 from models.motion.kinematics import bone_lengths, fit_bone_lengths, forward_kinematics
 from models.motion.motion import Motion
-from models.motion.skeleton import BODY21, SMPL22
+from models.motion.skeleton import BODY21, SMPL22, Skeleton
 
 TREE = """HIERARCHY
 ROOT Hips
@@ -233,18 +234,50 @@ def test_a_rigid_motion_without_rotations_gets_them_from_its_positions(tmp_path)
     assert text.count("CHANNELS 6") == 1
 
 
-@pytest.mark.parametrize("skeleton", [BODY21, SMPL22], ids=lambda s: s.name)
-def test_bones_that_stretch_get_position_channels_and_come_back(tmp_path, skeleton):
+def soft(skeleton: Skeleton) -> np.ndarray:
     rng = np.random.default_rng(1)
     still = rng.normal(size=(1, skeleton.num_joints, 3))
-    positions = still + 0.02 * rng.normal(size=(15, skeleton.num_joints, 3))
+    return still + 0.02 * rng.normal(size=(15, skeleton.num_joints, 3))
+
+
+def with_bones(positions: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     lengths = np.full(skeleton.num_joints, 0.3)
-    lengths[0] = 0.0
-    for path in (positions, fit_bone_lengths(positions, lengths, skeleton.parents)):
-        motion = Motion(name="soft", skeleton=skeleton, positions=path, fps=24.0)
-        _, text, back = read_back(tmp_path, motion)
-        assert np.linalg.norm(back - path, axis=-1).max() < 1e-4
-        assert text.count("CHANNELS 6") > 1
+    return fit_bone_lengths(positions, lengths, skeleton.parents)
+
+
+@pytest.mark.parametrize("skeleton", [BODY21, SMPL22], ids=lambda s: s.name)
+def test_bones_that_stretch_get_position_channels_without_offset(tmp_path, skeleton):
+    motion = Motion(name="soft", skeleton=skeleton, positions=soft(skeleton), fps=24.0)
+    _, text, back = read_back(tmp_path, motion)
+    assert np.linalg.norm(back - motion.positions, axis=-1).max() < 1e-4
+    assert text.count("CHANNELS 6") > 1
+    assert text.count("OFFSET 0.000000 0.000000 0.000000") >= text.count("CHANNELS 6")
+
+
+@pytest.mark.parametrize("skeleton", [BODY21, SMPL22], ids=lambda s: s.name)
+def test_siblings_that_change_their_angles_hang_on_joints_that_turn_for_them(tmp_path, skeleton):
+    path = with_bones(soft(skeleton), skeleton)
+    motion = Motion(name="loose", skeleton=skeleton, positions=path, fps=24.0)
+    back, text, positions = read_back(tmp_path, motion)
+    assert np.linalg.norm(positions - path, axis=-1).max() < 1e-4
+    assert text.count("CHANNELS 6") == 1
+    turning = [joint for joint in back.skeleton.joints if "_to_" in joint]
+    assert turning
+    for joint in turning:
+        index = back.skeleton.index(joint)
+        (child,) = back.skeleton.children[index]
+        assert joint.endswith(f"_to_{back.skeleton.joints[child]}")
+
+
+@pytest.mark.parametrize("skeleton", [BODY21, SMPL22], ids=lambda s: s.name)
+def test_another_reader_finds_the_same_positions(tmp_path, skeleton):
+    path = with_bones(soft(skeleton), skeleton)
+    write_bvh(tmp_path / "x.bvh", Motion(name="x", skeleton=skeleton, positions=path, fps=24.0))
+    read = pybvh.read_bvh_file(tmp_path / "x.bvh")
+    assert read.fps == pytest.approx(24.0, abs=1e-4)
+    found = np.asarray(read.joint_positions())[..., [2, 0, 1]] / 100.0
+    order = [read.joint_names.index(joint) for joint in skeleton.joints]
+    assert np.linalg.norm(found[:, order] - path, axis=-1).max() < 1e-3
 
 
 def test_writing_what_was_read_is_the_identity(tmp_path):
