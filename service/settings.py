@@ -56,7 +56,7 @@ class Settings(BaseSettings):
     )
     pose_landmarker: DirectoryPath | None = Field(
         default=None,
-        description="folder with MediaPipe's files for the page's webcam: `npm run webcam` in web/",
+        description="folder with MediaPipe's files, for the webcam of the page",
     )
     otel_endpoint: str | None = Field(
         default=None, validation_alias="OTEL_EXPORTER_OTLP_ENDPOINT", description="takes spans"

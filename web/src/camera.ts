@@ -15,9 +15,9 @@ export async function checkFiles(): Promise<void> {
   const found = await fetch(BUNDLE, { method: "HEAD" }).catch(() => null);
   if (found?.ok) return;
   throw new Error(
-    "The webcam needs MediaPipe, which this server does not have. Who runs it sets " +
-      "POSEFUTURES_POSE_LANDMARKER to a folder with vision_bundle.mjs and wasm/ of " +
-      "@mediapipe/tasks-vision 1.1.0 and with the model pose_landmarker.task.",
+    "The webcam needs MediaPipe, which this server does not have. Who runs it puts " +
+      "vision_bundle.mjs and wasm/ of @mediapipe/tasks-vision 1.1.0 (`npm run webcam` in web/) and " +
+      "Google's model pose_landmarker.task into a folder, and names that in POSEFUTURES_POSE_LANDMARKER.",
   );
 }
 
