@@ -5,9 +5,9 @@ from functools import partial
 
 from models.continuation import Continuation
 from models.diffusion import sqrt_schedule
-from models.motion.skeleton import BODY21, H36M17, SMPL22
 from models.pose import RootRelativePoses, WorldPoses
-from models.system import Augmentation, Data, Recipe, Stage
+from models.protocols import AMASS, H36M, HELD_OUT, TWO_SECONDS, mocap_data
+from models.system import Data, Recipe, Stage
 from models.systems.belfusion import objective, recurrent, spectral
 from models.systems.belfusion.dense_unet import DenseUNet
 from models.systems.belfusion.graphs import graphs
@@ -15,7 +15,6 @@ from models.systems.belfusion.objective import BeLFusion
 from models.systems.belfusion.unet import PictureUNet
 
 NUM_STEPS = 10
-EVERYTHING = {"bandai": 0.5, "cmu": 0.45, "hdm05": 0.05}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -123,38 +122,13 @@ def mocap(
     updates: tuple[int, int, int, int] = (1_500, 500, 300, 14_000),
 ) -> Recipe:
     """Ours: 30 fps, half a second to two seconds, world trajectory, on public motion capture."""
-    data = Data(
-        skeleton=BODY21,
-        fps=30.0,
-        num_observed=15,
-        horizon=60,
-        shares=shares or EVERYTHING,
-        hold_out=hold_out,
-        augmentation=Augmentation(
-            yaw=False,  # the canonical frame undoes it
-            slowest=0.8,
-            fastest=1.25,
-            body_scale=0.05,
-            bone_scale=0.06,
-            observation_noise=0.008,
-        ),
-    )
+    data = mocap_data(shares=shares, hold_out=hold_out)
     return _spectral_recipe("mocap", data, SpectralSizes(), updates)
 
 
 def mocap_held_out() -> Recipe:
     """`mocap` without two styles, two subjects and four actions, to be measured on them."""
-    hold_out = (
-        "style=tired",
-        "style=elderly",
-        "subject=135",
-        "subject=13",
-        "action=washwindow",
-        "action=drink",
-        "action=directing_traffic",
-        "action=soccer",
-    )
-    return dataclasses.replace(mocap(hold_out=hold_out), name="mocap_held_out")
+    return dataclasses.replace(mocap(hold_out=HELD_OUT), name="mocap_held_out")
 
 
 def mocap_everything() -> Recipe:
@@ -175,7 +149,6 @@ def mocap_cmu() -> Recipe:
 
 def tiny() -> Recipe:
     """Seconds of training, for tests."""
-    data = Data(skeleton=BODY21, fps=30.0, num_observed=15, horizon=60)
     sizes = SpectralSizes(
         latent=16,
         context=16,
@@ -186,7 +159,7 @@ def tiny() -> Recipe:
         num_target=3,
         levels=(32, 16),
     )
-    recipe = _spectral_recipe("tiny", data, sizes, (8, 4, 4, 8), batch_size=16, candidates=4)
+    recipe = _spectral_recipe("tiny", TWO_SECONDS, sizes, (8, 4, 4, 8), batch_size=16, candidates=4)
     return recipe
 
 
@@ -211,7 +184,7 @@ def h36m() -> Recipe:
     """The paper's sizes and protocol on Human3.6M: 50 Hz, 25 frames seen, 100 predicted."""
     return _recurrent_recipe(
         "h36m",
-        Data(skeleton=H36M17, fps=50.0, num_observed=25, horizon=100),
+        H36M,
         _recurrent_stages(
             updates=(39_000, 39_000, 39_000, 34_000),
             rates=(0.005, 0.0005),
@@ -224,7 +197,7 @@ def amass() -> Recipe:
     """The paper's sizes and protocol on AMASS: 60 Hz, 30 frames seen, 120 predicted."""
     return _recurrent_recipe(
         "amass",
-        Data(skeleton=SMPL22, fps=60.0, num_observed=30, horizon=120),
+        AMASS,
         _recurrent_stages(
             updates=(78_000, 78_000, 39_000, 197_000),
             rates=(0.001, 0.005),

@@ -6,9 +6,10 @@ from functools import partial
 import torch
 
 from models.diffusion import linear_schedule
-from models.motion.skeleton import BODY21, H36M17, HUMANEVA15
+from models.motion.skeleton import HUMANEVA15
 from models.pose import RootRelativePoses, WorldPoses
-from models.system import Augmentation, Data, Recipe, Stage
+from models.protocols import H36M, HELD_OUT, TWO_SECONDS, mocap_data
+from models.system import Data, Recipe, Stage
 from models.systems.motiondiff import keyframes, objective, paper
 from models.systems.motiondiff.graphs import graphs
 from models.systems.motiondiff.objective import MotionDiff
@@ -17,7 +18,6 @@ from models.systems.motiondiff.refiner import Refiner, batch_norm, layer_norm
 NUM_STEPS = 100
 STEPS = 10
 GAMMA = 0.1
-EVERYTHING = {"bandai": 0.5, "cmu": 0.45, "hdm05": 0.05}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -140,38 +140,13 @@ def mocap(
     updates: tuple[int, int] = (9_000, 600),
 ) -> Recipe:
     """Ours: 30 fps, half a second to two seconds, world trajectory, on public motion capture."""
-    data = Data(
-        skeleton=BODY21,
-        fps=30.0,
-        num_observed=15,
-        horizon=60,
-        shares=EVERYTHING,
-        hold_out=hold_out,
-        augmentation=Augmentation(
-            yaw=False,  # the canonical frame undoes it
-            slowest=0.8,
-            fastest=1.25,
-            body_scale=0.05,
-            bone_scale=0.06,
-            observation_noise=0.008,
-        ),
-    )
+    data = mocap_data(hold_out=hold_out)
     return _keyframe_recipe("mocap", data, Sizes(), updates=updates)
 
 
 def mocap_held_out() -> Recipe:
     """`mocap` without two styles, two subjects and four actions, to be measured on them."""
-    hold_out = (
-        "style=tired",
-        "style=elderly",
-        "subject=135",
-        "subject=13",
-        "action=washwindow",
-        "action=drink",
-        "action=directing_traffic",
-        "action=soccer",
-    )
-    return dataclasses.replace(mocap(hold_out=hold_out), name="mocap_held_out")
+    return dataclasses.replace(mocap(hold_out=HELD_OUT), name="mocap_held_out")
 
 
 def mocap_diffusion_held_out() -> Recipe:
@@ -199,7 +174,7 @@ def mocap_without_spatial_transformer() -> Recipe:
 
 def h36m() -> Recipe:
     """The paper's sizes and protocol on Human3.6M: 50 Hz, 25 frames seen, 100 predicted."""
-    data = Data(skeleton=H36M17, fps=50.0, num_observed=25, horizon=100)
+    data = H36M
     return _paper_recipe("h36m", data, PaperSizes(), updates=(62_500, 31_250))
 
 
@@ -239,7 +214,7 @@ def tiny() -> Recipe:
         hidden=16,
         blocks=1,
     )
-    data = Data(skeleton=BODY21, fps=30.0, num_observed=15, horizon=60)
+    data = TWO_SECONDS
     return _keyframe_recipe("tiny", data, sizes, updates=(8, 4), rows=(16, 4, 3))
 
 
@@ -256,7 +231,7 @@ def tiny_paper() -> Recipe:
         hidden=16,
         blocks=1,
     )
-    data = Data(skeleton=H36M17, fps=50.0, num_observed=25, horizon=100)
+    data = H36M
     return _paper_recipe("tiny_paper", data, sizes, updates=(2, 2), rows=(4, 2, 2))
 
 

@@ -8,8 +8,9 @@ import torch
 from torch.nn import functional
 
 from models.diffusion import Schedule, cosine_schedule
-from models.motion.skeleton import BODY21, H36M17, SMPL22
-from models.system import Augmentation, Data, Recipe, Stage
+from models.motion.skeleton import BODY21
+from models.protocols import AMASS, H36M, HELD_OUT, TWO_SECONDS, mocap_data
+from models.system import Data, Recipe, Stage
 from models.systems.skeletondiffusion import objective
 from models.systems.skeletondiffusion.graphs import graphs
 from models.systems.skeletondiffusion.networks import Decoder, Denoiser, Encoder, PastNetwork
@@ -26,17 +27,6 @@ from models.systems.skeletondiffusion.objective import SkeletonDiffusion
 
 NUM_STEPS = 10
 DEFAULT_STEPS = 3  # the knee of the curve on `valid`
-EVERYTHING = {"bandai": 0.5, "cmu": 0.45, "hdm05": 0.05}
-HELD_OUT = (
-    "style=tired",
-    "style=elderly",
-    "subject=135",
-    "subject=13",
-    "action=washwindow",
-    "action=drink",
-    "action=directing_traffic",
-    "action=soccer",
-)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -124,25 +114,6 @@ def _network(
     )
 
 
-def _mocap_data(hold_out: tuple[str, ...]) -> Data:
-    return Data(
-        skeleton=BODY21,
-        fps=30.0,
-        num_observed=15,
-        horizon=60,
-        shares=EVERYTHING,
-        hold_out=hold_out,
-        augmentation=Augmentation(
-            yaw=False,  # the canonical frame undoes it
-            slowest=0.8,
-            fastest=1.25,
-            body_scale=0.05,
-            bone_scale=0.06,
-            observation_noise=0.008,
-        ),
-    )
-
-
 def _autoencoder_stage(num_updates: int, *, batch_size: int = 64) -> Stage:
     return Stage(
         name="autoencoder",
@@ -219,7 +190,7 @@ def mocap_autoencoder() -> Recipe:
     """The autoencoder that `mocap_held_out` and its ablations start from, held-out clips unseen."""
     return _recipe(
         "mocap_autoencoder",
-        _mocap_data(HELD_OUT),
+        mocap_data(hold_out=HELD_OUT),
         Sizes(),
         _schedule(with_root(BODY21), falling),
         stages=(_autoencoder_stage(4_000),),
@@ -228,7 +199,7 @@ def mocap_autoencoder() -> Recipe:
 
 def _held_out(name: str, schedule: Schedule) -> Recipe:
     stages = (_denoiser_stage(5_000, schedule),)
-    return _recipe(name, _mocap_data(HELD_OUT), Sizes(), schedule, stages=stages)
+    return _recipe(name, mocap_data(hold_out=HELD_OUT), Sizes(), schedule, stages=stages)
 
 
 def mocap_held_out() -> Recipe:
@@ -261,7 +232,7 @@ def mocap() -> Recipe:
     schedule = _schedule(with_root(BODY21), falling)
     return _recipe(
         "mocap",
-        _mocap_data(()),
+        mocap_data(),
         Sizes(),
         schedule,
         stages=(_autoencoder_stage(4_000), _denoiser_stage(5_000, schedule)),
@@ -274,7 +245,7 @@ def tiny() -> Recipe:
     schedule = _schedule(with_root(BODY21), falling)
     recipe = _recipe(
         "tiny",
-        Data(skeleton=BODY21, fps=30.0, num_observed=15, horizon=60),
+        TWO_SECONDS,
         sizes,
         schedule,
         stages=(
@@ -302,15 +273,13 @@ PAPER = Sizes(
 
 def h36m() -> Recipe:
     """The paper's sizes and protocol on Human3.6M: 50 Hz, 25 frames seen, 100 predicted."""
-    data = Data(skeleton=H36M17, fps=50.0, num_observed=25, horizon=100)
-    return _paper_recipe("h36m", data, PAPER, box_m=1.5, updates=(97_000, 48_500))
+    return _paper_recipe("h36m", H36M, PAPER, box_m=1.5, updates=(97_000, 48_500))
 
 
 def amass() -> Recipe:
     """The paper's sizes and protocol on AMASS: 60 Hz, 30 frames seen, 120 predicted."""
-    data = Data(skeleton=SMPL22, fps=60.0, num_observed=30, horizon=120)
     sizes = dataclasses.replace(PAPER, encoder_layers=2)
-    return _paper_recipe("amass", data, sizes, box_m=1.2, updates=(174_000, 87_000))
+    return _paper_recipe("amass", AMASS, sizes, box_m=1.2, updates=(174_000, 87_000))
 
 
 def tiny_paper() -> Recipe:
@@ -318,7 +287,7 @@ def tiny_paper() -> Recipe:
     sizes = dataclasses.replace(
         PAPER, latent=4, hidden=8, width=8, depth=1, heads=2, head_width=4, time=8
     )
-    data = Data(skeleton=H36M17, fps=50.0, num_observed=25, horizon=20)
+    data = dataclasses.replace(H36M, horizon=20)
     return _paper_recipe(
         "tiny_paper", data, sizes, box_m=1.5, updates=(2, 2), batch_size=4, candidates=2
     )
