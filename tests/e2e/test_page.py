@@ -290,7 +290,7 @@ def test_the_future_that_is_shown_alone_is_saved_as_a_bvh_that_can_be_read(page,
     saved.value.save_as(tmp_path / saved.value.suggested_filename)
     assert saved.value.suggested_filename.endswith("-4.bvh")
     motion = read_motion(tmp_path / saved.value.suggested_filename)
-    assert motion.positions.shape == (60, 21, 3)
+    assert motion.num_frames == 60
     assert motion.duration == pytest.approx(2.0, abs=0.05)
 
 
