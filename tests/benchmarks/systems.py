@@ -30,7 +30,7 @@ BUNDLE = ROOT / "models/bundles/motiondiff"
 BESIDE = ROOT / "models/bundles/belfusion"
 
 
-def main(
+def main(  # noqa: PLR0913 - the options of a command
     *,
     bundle: Annotated[Path, typer.Option(help="whose speed is asked for")] = BUNDLE,
     recipe: Annotated[str, typer.Option(help="its paper's sizes")] = RECIPE,
