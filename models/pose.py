@@ -74,6 +74,19 @@ def cosine_basis(num_bases: int, length: int) -> Float[Tensor, "length num_bases
     return basis.float()
 
 
+def relative_to_root(num_joints: int, *, root_weight: float) -> Float[Tensor, "F F"]:
+    """Flat poses (rows) to joints relative to the root, beside the root itself, weighted."""
+    mixing = torch.eye(num_joints)
+    mixing[0, 1:] = -1
+    mixing[0, 0] = root_weight
+    return per_axis(mixing)
+
+
+def per_axis(matrix: Float[Tensor, "J K"]) -> Float[Tensor, "F G"]:
+    """A matrix over joints as one over flat poses: the same for each of the three coordinates."""
+    return torch.kron(matrix, torch.eye(3))
+
+
 class WorldPoses:
     """Features of poses in the canonical frame, the root's path included.
 
@@ -85,10 +98,7 @@ class WorldPoses:
         self.num_features = 3 * skeleton.num_joints
         self._pairs = facing(skeleton)
         # Rows in, columns out: one small product takes the place of slices and sums.
-        mixing = torch.eye(skeleton.num_joints)
-        mixing[0, 1:] = -1
-        mixing[0, 0] = root_weight
-        self._to_features = torch.kron(mixing, torch.eye(3))
+        self._to_features = relative_to_root(skeleton.num_joints, root_weight=root_weight)
         self._to_poses = torch.linalg.inv(self._to_features.double()).float()
 
     def enter(

@@ -134,6 +134,11 @@ class Recipe:
     symmetries: tuple[str, ...] = ("yaw", "translation")
 
 
+def stepwise(progress: float, *, factor: float, steps: int, flat: int = 0) -> float:
+    """A decay that multiplies by a factor at every step of a run but the first ``flat``."""
+    return factor ** max(0, int(progress * steps) - flat)
+
+
 def describe(value: Any) -> Any:
     """A recipe, or any part of it, as JSON: functions by dotted name, with their arguments."""
     if isinstance(value, functools.partial):

@@ -7,7 +7,7 @@ from models.continuation import Continuation
 from models.diffusion import sqrt_schedule
 from models.pose import RootRelativePoses, WorldPoses
 from models.protocols import AMASS, H36M, HELD_OUT, TWO_SECONDS, mocap_data
-from models.system import Data, Recipe, Stage
+from models.system import Data, Recipe, Stage, stepwise
 from models.systems.belfusion import objective, recurrent, spectral
 from models.systems.belfusion.dense_unet import DenseUNet
 from models.systems.belfusion.graphs import graphs
@@ -109,10 +109,6 @@ def build_recurrent(
         latent=latent,
         context=context,
     )
-
-
-def _stepwise(progress: float, *, factor: float, steps: int) -> float:
-    return factor ** int(progress * steps)
 
 
 def mocap(
@@ -232,7 +228,7 @@ def _recurrent_stages(
 ) -> tuple[Stage, ...]:
     behaviour, coupler, observation, denoiser = updates
     main, auxiliary = rates
-    epochs_10 = partial(_stepwise, factor=0.9, steps=10)
+    epochs_10 = partial(stepwise, factor=0.9, steps=10)
     return (
         Stage(
             name="behaviour",
@@ -252,7 +248,7 @@ def _recurrent_stages(
             num_updates=coupler,
             batch_size=batch_size,
             learning_rate=main,
-            decay=partial(_stepwise, factor=0.9, steps=20),
+            decay=partial(stepwise, factor=0.9, steps=20),
             amsgrad=True,
         ),
         Stage(
@@ -262,7 +258,7 @@ def _recurrent_stages(
             num_updates=observation,
             batch_size=batch_size,
             learning_rate=1e-3,
-            decay=partial(_stepwise, factor=0.8, steps=1),
+            decay=partial(stepwise, factor=0.8, steps=1),
             amsgrad=True,
         ),
         Stage(
@@ -278,7 +274,7 @@ def _recurrent_stages(
             num_updates=denoiser,
             batch_size=batch_size,
             learning_rate=5e-4,
-            decay=partial(_stepwise, factor=0.9, steps=2),
+            decay=partial(stepwise, factor=0.9, steps=2),
             amsgrad=True,
             ema_decay=0.999,
         ),

@@ -9,7 +9,7 @@ from models.diffusion import linear_schedule
 from models.motion.skeleton import HUMANEVA15
 from models.pose import RootRelativePoses, WorldPoses
 from models.protocols import H36M, HELD_OUT, TWO_SECONDS, mocap_data
-from models.system import Data, Recipe, Stage
+from models.system import Data, Recipe, Stage, stepwise
 from models.systems.motiondiff import keyframes, objective, paper
 from models.systems.motiondiff.graphs import graphs
 from models.systems.motiondiff.objective import MotionDiff
@@ -174,8 +174,7 @@ def mocap_without_spatial_transformer() -> Recipe:
 
 def h36m() -> Recipe:
     """The paper's sizes and protocol on Human3.6M: 50 Hz, 25 frames seen, 100 predicted."""
-    data = H36M
-    return _paper_recipe("h36m", data, PaperSizes(), updates=(62_500, 31_250))
+    return _paper_recipe("h36m", H36M, PaperSizes(), updates=(62_500, 31_250))
 
 
 def humaneva() -> Recipe:
@@ -245,10 +244,6 @@ def _constant_then_linear(progress: float, *, constant: float) -> float:
     return min(1.0, (1.0 - progress) / (1.0 - constant))
 
 
-def _stepwise(progress: float, *, factor: float, steps: int) -> float:
-    return factor ** int(progress * steps)
-
-
 def _paper_recipe(
     name: str,
     data: Data,
@@ -298,7 +293,7 @@ def _paper_recipe(
                 num_updates=refinement,
                 batch_size=observations,
                 learning_rate=5e-4,
-                decay=partial(_stepwise, factor=0.96, steps=50),
+                decay=partial(stepwise, factor=0.96, steps=50),
                 gradient_clip=1.0,
             ),
         ),

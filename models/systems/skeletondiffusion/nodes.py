@@ -11,15 +11,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from models.motion.skeleton import Skeleton
-from models.pose import Frame, facing
+from models.pose import Frame, facing, per_axis, relative_to_root
 from models.systems.skeletondiffusion.noise import NodeGraph, with_root, without_root
 
 SHORTEST_SQUARED = 1e-8
 MOVES_BY = 3.0
 """What was moved in half a second counts this much more than where it is."""
 
-LAST, BEFORE, VELOCITY, LENGTH = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 10)
-"""What `LimbNodes.start` says of a limb."""
+LAST, VELOCITY, LENGTH = slice(0, 3), slice(6, 9), slice(9, 10)
+"""What `LimbNodes.start` says of a limb; between them, where it was a frame before."""
 
 
 class RootRelativeNodes(nn.Module):
@@ -135,8 +135,12 @@ class LimbNodes(nn.Module):
         self.register_buffer("basis", held, persistent=False)
         joints, xyz = torch.eye(skeleton.num_joints), torch.ones(3, 3)
         self.register_buffer("of_one_limb", torch.kron(joints, xyz), persistent=False)
-        self.register_buffer("to_joints", _per_axis(_chains(skeleton)), persistent=False)
-        self.register_buffer("weights", _per_axis(_weights(joints, root_weight)), persistent=False)
+        self.register_buffer("to_joints", per_axis(_chains(skeleton)), persistent=False)
+        self.register_buffer(
+            "weights",
+            relative_to_root(skeleton.num_joints, root_weight=root_weight),
+            persistent=False,
+        )
         is_root = torch.arange(self.of_one_limb.shape[0]) < 3
         self.register_buffer("root", is_root.float(), persistent=False)
         self._pairs = facing(skeleton)
@@ -242,15 +246,3 @@ def _chains(skeleton: Skeleton) -> Float[Tensor, "J J"]:
     for joint in range(1, skeleton.num_joints):
         chains[:, joint] += chains[:, skeleton.parents[joint]]
     return chains
-
-
-def _weights(joints: Float[Tensor, "J J"], root_weight: float) -> Float[Tensor, "J J"]:
-    weights = joints.clone()
-    weights[0, 1:] = -1
-    weights[0, 0] = root_weight
-    return weights
-
-
-def _per_axis(matrix: Float[Tensor, "J J"]) -> Float[Tensor, "F F"]:
-    """The same for each of the three coordinates."""
-    return torch.kron(matrix, torch.eye(3))

@@ -10,7 +10,7 @@ from torch.nn import functional
 from models.diffusion import Schedule, cosine_schedule
 from models.motion.skeleton import BODY21
 from models.protocols import AMASS, H36M, HELD_OUT, TWO_SECONDS, mocap_data
-from models.system import Data, Recipe, Stage
+from models.system import Data, Recipe, Stage, stepwise
 from models.systems.skeletondiffusion import objective
 from models.systems.skeletondiffusion.graphs import graphs
 from models.systems.skeletondiffusion.networks import Decoder, Denoiser, Encoder, PastNetwork
@@ -211,7 +211,7 @@ def mocap_held_out() -> Recipe:
 
 
 def mocap_longer() -> Recipe:
-    """What ships: a finished `mocap_held_out` goes on, latents kept."""
+    """A finished `mocap_held_out` goes on, latents kept."""
     recipe = mocap_held_out()
     denoiser = dataclasses.replace(recipe.stages[-1], prepare=None, learning_rate=8e-4)
     return dataclasses.replace(recipe, name="mocap_longer", stages=(denoiser,))
@@ -243,7 +243,7 @@ def tiny() -> Recipe:
     """Seconds of training, for tests."""
     sizes = Sizes(latent=4, hidden=8, past=8, width=8, heads=2, head_width=4, time=8)
     schedule = _schedule(with_root(BODY21), falling)
-    recipe = _recipe(
+    return _recipe(
         "tiny",
         TWO_SECONDS,
         sizes,
@@ -253,7 +253,6 @@ def tiny() -> Recipe:
             _denoiser_stage(8, schedule, batch_size=16, candidates=4),
         ),
     )
-    return recipe
 
 
 PAPER = Sizes(
@@ -331,7 +330,7 @@ def _paper_recipe(  # noqa: PLR0913 - the parts of a recipe
                 num_updates=autoencoder,
                 batch_size=batch_size,
                 learning_rate=5e-3,
-                decay=partial(_by_epochs, factor=0.98, epochs=200, flat=10),
+                decay=partial(stepwise, factor=0.98, steps=200, flat=10),
                 amsgrad=True,
                 gradient_clip=1.0,
             ),
@@ -348,13 +347,9 @@ def _paper_recipe(  # noqa: PLR0913 - the parts of a recipe
                 num_updates=denoiser,
                 batch_size=batch_size,
                 learning_rate=1e-3,
-                decay=partial(_by_epochs, factor=0.99, epochs=150, flat=75),
+                decay=partial(stepwise, factor=0.99, steps=150, flat=75),
                 gradient_clip=1.0,
                 ema_decay=0.995,
             ),
         ),
     )
-
-
-def _by_epochs(progress: float, *, factor: float, epochs: int, flat: int) -> float:
-    return factor ** max(0, int(progress * epochs) - flat)
