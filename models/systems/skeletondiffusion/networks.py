@@ -134,7 +134,11 @@ class PastNetwork(nn.Module):
 
 
 class Denoiser(nn.Module):
-    """g: residual blocks and attention over the nodes; x0 from x_t, the past and the timestep."""
+    """g: residual blocks and attention over the nodes; x0 from x_t, the past and the timestep.
+
+    With ``joins_first`` the last block also sees what entered the first one, as the paper's does;
+    without, only as far as the residual paths carry it.
+    """
 
     steps: Tensor
 
@@ -151,8 +155,10 @@ class Denoiser(nn.Module):
         time: int,
         num_steps: int,
         activation: Activation,
+        joins_first: bool = True,
     ) -> None:
         super().__init__()
+        self.joins_first = joins_first
         self.condition = TypedGraphLinear(graph, past, width, bias=False)
         self.enter = TypedGraphLinear(graph, latent, width)
         frequencies = torch.exp(-math.log(10_000) * torch.arange(width // 2) / (width // 2))
@@ -171,7 +177,9 @@ class Denoiser(nn.Module):
             TypedGraphAttention(graph, width, heads=heads, head_width=head_width)
             for _ in range(2 * depth - 1)
         )
-        self.last = ResidualBlock(graph, 2 * width, width, time=time, activation=activation)
+        self.last = ResidualBlock(
+            graph, 2 * width if joins_first else width, width, time=time, activation=activation
+        )
         self.leave = TypedGraphLinear(graph, width, latent)
 
     def forward(
@@ -191,5 +199,6 @@ class Denoiser(nn.Module):
         first = value = self.enter(x_t) + condition
         for block, attention in zip(self.blocks, [*self.attentions, nn.Identity()], strict=True):
             value = attention(block(value, time, timestep))
-        result: Tensor = self.leave(self.last(torch.cat([first, value], dim=2), time, timestep))
+        joined = torch.cat([first, value], dim=2) if self.joins_first else value
+        result: Tensor = self.leave(self.last(joined, time, timestep))
         return result

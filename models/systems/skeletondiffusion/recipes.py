@@ -39,11 +39,12 @@ class Sizes:
     shortcuts: bool = True
     limit: float = 4.0
     past: int = 96
-    width: int = 96
+    width: int = 80
     depth: int = 1
     heads: int = 4
     head_width: int = 16
     time: int = 96
+    joins_first: bool = False
     activation: Callable[[torch.Tensor], torch.Tensor] = functional.silu
 
 
@@ -109,6 +110,7 @@ def _network(
             time=sizes.time,
             num_steps=NUM_STEPS,
             activation=sizes.activation,
+            joins_first=sizes.joins_first,
         ),
         past=past,
     )
@@ -266,6 +268,7 @@ PAPER = Sizes(
     heads=8,
     head_width=32,
     time=768,
+    joins_first=True,
     activation=torch.tanh,
 )
 
