@@ -99,8 +99,6 @@ class LimbNodes(nn.Module):
     """
 
     start_width = 10
-    spline: Tensor
-    glide: Tensor
     scale: Tensor
     basis: Tensor
     of_one_limb: Tensor
@@ -128,8 +126,6 @@ class LimbNodes(nn.Module):
         self.decoder_ticks = -(-spline.shape[1] // knots_per_tick)
         self.outputs_per_tick = 3 * knots_per_tick
         self.observed_width = 3 * num_observed
-        self.register_buffer("spline", spline, persistent=False)
-        self.register_buffer("glide", glide, persistent=False)
         self.register_buffer("scale", torch.ones(skeleton.num_joints))
         held = torch.cat([spline, glide, torch.ones_like(glide)], dim=1)
         self.register_buffer("basis", held, persistent=False)
@@ -145,6 +141,16 @@ class LimbNodes(nn.Module):
         self.register_buffer("root", is_root.float(), persistent=False)
         self._pairs = facing(skeleton)
         self._parents = list(skeleton.parents[1:])
+
+    @property
+    def spline(self) -> Float[Tensor, "H P"]:
+        """What each free control point adds to the frames."""
+        return self.basis[:, :-2]
+
+    @property
+    def glide(self) -> Float[Tensor, "H 1"]:
+        """What the observed velocity adds to the frames."""
+        return self.basis[:, -2:-1]
 
     def _limbs(
         self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B L J 3"]

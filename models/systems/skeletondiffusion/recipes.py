@@ -188,13 +188,17 @@ def _schedule(graph: NodeGraph, gamma: Callable[[float], float]) -> Schedule:
     return nonisotropic(cosine_schedule(NUM_STEPS).alpha_bar, graph.eigen()[0], gamma=gamma)
 
 
+def _with_hips(gamma: Callable[[float], float]) -> Schedule:
+    return _schedule(with_root(BODY21), gamma)
+
+
 def mocap_autoencoder() -> Recipe:
     """The autoencoder that `mocap_held_out` and its ablations start from, held-out clips unseen."""
     return _recipe(
         "mocap_autoencoder",
         mocap_data(hold_out=HELD_OUT),
         Sizes(),
-        _schedule(with_root(BODY21), falling),
+        _with_hips(falling),
         stages=(_autoencoder_stage(4_000),),
     )
 
@@ -209,7 +213,7 @@ def mocap_held_out() -> Recipe:
 
     Goes on from a finished `mocap_autoencoder`.
     """
-    return _held_out("mocap_held_out", _schedule(with_root(BODY21), falling))
+    return _held_out("mocap_held_out", _with_hips(falling))
 
 
 def mocap_longer() -> Recipe:
@@ -226,12 +230,12 @@ def mocap_isotropic() -> Recipe:
 
 def mocap_constant_gamma() -> Recipe:
     """The ablation of Table 4: `mocap_held_out` with gamma_t = 1."""
-    return _held_out("mocap_constant_gamma", _schedule(with_root(BODY21), constant))
+    return _held_out("mocap_constant_gamma", _with_hips(constant))
 
 
 def mocap() -> Recipe:
     """Ours: 30 fps, half a second to two seconds, world trajectory, on public motion capture."""
-    schedule = _schedule(with_root(BODY21), falling)
+    schedule = _with_hips(falling)
     return _recipe(
         "mocap",
         mocap_data(),
@@ -244,7 +248,7 @@ def mocap() -> Recipe:
 def tiny() -> Recipe:
     """Seconds of training, for tests."""
     sizes = Sizes(latent=4, hidden=8, past=8, width=8, heads=2, head_width=4, time=8)
-    schedule = _schedule(with_root(BODY21), falling)
+    schedule = _with_hips(falling)
     return _recipe(
         "tiny",
         TWO_SECONDS,
