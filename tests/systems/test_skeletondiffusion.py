@@ -291,20 +291,33 @@ def test_candidate_nearest_to_the_real_motion_learns():
     torch.testing.assert_close(found, right)
 
 
-def test_latents_are_whitened_in_the_loss_by_the_noise_of_their_direction():
+def loss_of_constant_latents(eigenvalues, **how) -> float:
+    """The latent term where the denoiser says the same whatever the noise."""
     network = random_like(recipes.tiny().build())
-    poses = body(75).repeat(4, 1, 1, 1)
-    batch = {"observation": poses[:, :15], "seen": poses[:, :15], "future": poses[:, 15:]}
-    wide = nonisotropic(ALPHA_BAR, 4 * with_root(BODY21).eigen()[0], gamma=constant)
-    narrow = nonisotropic(ALPHA_BAR, with_root(BODY21).eigen()[0], gamma=constant)
-    with torch.no_grad():  # a denoiser that ignores its input: the same x0 under either noise
+    with torch.no_grad():
         for parameter in network.denoiser.leave.features.parameters():
             parameter.zero_()
-    losses = [
-        objective.denoiser_loss(
-            network, batch, generator(), schedule=s, num_candidates=2,
-            reconstruction_weight=0.0, weighted_by_signal=True,
-        )["latent"].item()
-        for s in (wide, narrow)
-    ]  # fmt: skip
-    assert losses[1] == pytest.approx(2 * losses[0], rel=1e-4)
+    poses = body(75).repeat(4, 1, 1, 1)
+    batch = {"observation": poses[:, :15], "seen": poses[:, :15], "future": poses[:, 15:]}
+    losses = objective.denoiser_loss(
+        network, batch, generator(),
+        schedule=nonisotropic(ALPHA_BAR, eigenvalues, gamma=constant),
+        num_candidates=2, reconstruction_weight=0.0, **how,
+    )  # fmt: skip
+    return losses["latent"].item()
+
+
+def test_latents_are_whitened_in_the_loss_by_the_noise_of_their_direction():
+    eigenvalues = with_root(BODY21).eigen()[0]
+    wide, narrow = (
+        loss_of_constant_latents(scale * eigenvalues, weighted_by_signal=True) for scale in (4, 1)
+    )
+    assert narrow == pytest.approx(2 * wide, rel=1e-4)
+
+
+def test_whitening_of_directions_alone_is_blind_to_how_much_noise_there_is():
+    eigenvalues = with_root(BODY21).eigen()[0]
+    how = {"weighted_by_signal": False, "whitens_directions_alone": True}
+    wide, narrow = (loss_of_constant_latents(scale * eigenvalues, **how) for scale in (4, 1))
+    assert narrow == pytest.approx(wide, rel=1e-4)
+    assert loss_of_constant_latents(np.ones(21), **how) != pytest.approx(wide, rel=1e-2)

@@ -200,13 +200,16 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     num_candidates: int,
     reconstruction_weight: float,
     weighted_by_signal: bool,
+    whitens_directions_alone: bool = False,
     noisiest_share: float = 0.0,
 ) -> Losses:
     """Eq. 12: of k candidates, the one whose motion is nearest to the real one learns.
 
     All candidates are judged without gradients and in bfloat16; the winners are run again. Their
     latents learn by the whitened distance of eq. 11 (of first power), times alpha_bar where
-    ``weighted_by_signal``; where ``reconstruction_weight`` is not 0, their motions learn too.
+    ``weighted_by_signal``; where ``reconstruction_weight`` is not 0, their motions learn too. With
+    ``whitens_directions_alone`` the noise of a timestep counts in units of its mean over the
+    directions, so that no timestep weighs more than another.
     """
     observation, future = batch["observation"], batch["future"]
     rows, device = len(future), future.device
@@ -233,7 +236,8 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     chosen = x_t[:, torch.arange(rows, device=device), near]
     x0 = network.denoiser(network.from_eigenbasis(chosen), timestep, condition)
     difference = network.to_eigenbasis(x0) - z
-    whitened = (difference / variance[:, :, None].sqrt()).abs().mean(dim=(0, 2))
+    shape = variance / variance.mean(dim=0) if whitens_directions_alone else variance
+    whitened = (difference / shape[:, :, None].sqrt()).abs().mean(dim=(0, 2))
     latent = (whitened * alpha_bar if weighted_by_signal else whitened).mean()
     losses = {"total": latent, "latent": latent}
     if reconstruction_weight:

@@ -149,6 +149,7 @@ def _denoiser_stage(
             num_candidates=candidates,
             reconstruction_weight=5.0,
             weighted_by_signal=False,
+            whitens_directions_alone=True,
             noisiest_share=0.3,
         ),
         trains=("denoiser", "past"),
@@ -223,7 +224,7 @@ def mocap_longer() -> Recipe:
 
 def mocap_everything() -> Recipe:
     """What ships: a finished `mocap_longer` goes on, on every training clip, latents kept."""
-    return _goes_on("mocap_everything", mocap(), num_updates=3_000, learning_rate=4e-4)
+    return _goes_on("mocap_everything", mocap(), num_updates=2_000, learning_rate=4e-4)
 
 
 def _goes_on(name: str, recipe: Recipe, *, num_updates: int, learning_rate: float) -> Recipe:
