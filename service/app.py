@@ -23,6 +23,7 @@ from service.sessions import Sessions
 from service.settings import Settings
 from service.telemetry import telemetry_config
 from service.visits import Visits
+from service.warm_up import warm_up
 from service.worker import Limits, Worker
 
 NICENESS = 10
@@ -55,8 +56,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
 
     @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        loader = Thread(target=_load, args=[catalog], name="load-bundles", daemon=True)
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        work = [app, catalog, asyncio.get_running_loop()]
+        loader = Thread(target=_load, args=work, name="load-bundles", daemon=True)
         loader.start()
         watch = asyncio.create_task(metrics.watch_event_loop())
         yield
@@ -107,11 +109,15 @@ async def drain(app: FastAPI) -> None:
     await asyncio.gather(*(worker.drain(app.state.settings.drain_s) for worker in workers))
 
 
-def _load(catalog: Catalog) -> None:
+def _load(app: FastAPI, catalog: Catalog, loop: asyncio.AbstractEventLoop) -> None:
     """Load every bundle in this thread, whose priority all threads that compute inherit."""
+
+    def warmed_up() -> None:
+        asyncio.run_coroutine_threadsafe(warm_up(app, catalog), loop).result()
+
     if sys.platform == "linux":  # elsewhere the whole process has one
         os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
-    catalog.load()
+    catalog.load(warmed_up)
 
 
 def _say_limits(app: FastAPI, settings: Settings) -> None:

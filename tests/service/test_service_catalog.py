@@ -3,6 +3,7 @@ import os
 import shutil
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 
@@ -210,9 +211,9 @@ def test_only_loading_makes_a_server_unready(bundles: Path, monkeypatch: pytest.
     may_load = Event()
     load = Catalog.load
 
-    def held(catalog: Catalog) -> None:
+    def held(catalog: Catalog, *warm_up: Callable[[], object]) -> None:
         may_load.wait()
-        load(catalog)
+        load(catalog, *warm_up)
 
     monkeypatch.setattr(Catalog, "load", held)
     with Service.of(bundles) as service:
