@@ -3,7 +3,7 @@
 import asyncio
 import os
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from functools import partial
 from operator import attrgetter
@@ -30,10 +30,13 @@ NICENESS = 10
 """How much nicer the threads that compute are than the event loop, which waits for no slice."""
 
 
-def create_app(settings: Settings | None = None) -> FastAPI:
+def create_app(
+    settings: Settings | None = None, *, once_ready: Callable[[], object] = lambda: None
+) -> FastAPI:
     """The service; without settings it reads those of the environment.
 
-    Bundles load in a thread of their own, so that the server answers /livez from the start.
+    Bundles load in a thread of their own, so that the server answers /livez from the start; it
+    calls ``once_ready`` when requests can be answered.
 
     Raises:
         ServiceError: it is configured for something that is not installed.
@@ -57,7 +60,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        work = [app, catalog, asyncio.get_running_loop()]
+        work = [app, catalog, asyncio.get_running_loop(), once_ready]
         loader = Thread(target=_load, args=work, name="load-bundles", daemon=True)
         loader.start()
         watch = asyncio.create_task(metrics.watch_event_loop())
@@ -109,11 +112,17 @@ async def drain(app: FastAPI) -> None:
     await asyncio.gather(*(worker.drain(app.state.settings.drain_s) for worker in workers))
 
 
-def _load(app: FastAPI, catalog: Catalog, loop: asyncio.AbstractEventLoop) -> None:
+def _load(
+    app: FastAPI,
+    catalog: Catalog,
+    loop: asyncio.AbstractEventLoop,
+    once_ready: Callable[[], object],
+) -> None:
     """Load every bundle in this thread, whose priority all threads that compute inherit."""
 
     def warmed_up() -> None:
         asyncio.run_coroutine_threadsafe(warm_up(app, catalog), loop).result()
+        once_ready()
 
     if sys.platform == "linux":  # elsewhere the whole process has one
         os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)

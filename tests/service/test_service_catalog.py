@@ -229,6 +229,17 @@ def test_only_loading_makes_a_server_unready(bundles: Path, monkeypatch: pytest.
         assert service.post(BODY).status_code == 200
 
 
+def test_who_waits_for_a_server_is_told_once_that_it_is_ready(bundles: Path):
+    told: list[float] = []
+    settings = Settings(bundles=bundles, threads=1)
+    app = create_app(settings, once_ready=lambda: told.append(1.0))
+    with Service(app) as service:
+        assert told == []
+        service.wait_until_loaded()
+        assert service.post(BODY).status_code == 200
+        assert told == [1.0]
+
+
 def test_settings_come_from_the_environment(bundles: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("POSEFUTURES_BUNDLES", str(bundles))
     monkeypatch.setenv("POSEFUTURES_DEFAULT_MODEL", "still")
