@@ -24,7 +24,7 @@ from service.settings import Settings
 from service.telemetry import telemetry_config
 from service.visits import Visits
 from service.warm_up import warm_up
-from service.worker import Limits, Worker
+from service.worker import Worker
 
 NICENESS = 10
 """How much nicer the threads that compute are than the event loop, which waits for no slice."""
@@ -51,9 +51,7 @@ def create_app(
         worker=partial(
             Worker,
             threads=settings.num_workers,
-            limits=Limits(
-                max_requests=settings.max_queued_requests, max_rows=settings.max_queued_rows
-            ),
+            max_rows=settings.max_queued_rows,
             observer=metrics,
         ),
     )

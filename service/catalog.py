@@ -28,7 +28,7 @@ from service.errors import (
     UnknownModelError,
     UnsuitableModelError,
 )
-from service.worker import Limits, Worker
+from service.worker import Worker
 
 DEFAULT_FILE = "DEFAULT"
 GOLDEN_SAMPLES = 4
@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 
 def _unlimited(engine: Engine) -> Worker:
-    return Worker(engine, limits=Limits(max_requests=sys.maxsize, max_rows=sys.maxsize))
+    return Worker(engine, max_rows=sys.maxsize)
 
 
 @dataclass(kw_only=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from models.system import Graph, Recipe
 from service.engine.engine import Engine
 from service.engine.runner import Runner
 from service.engine.trajectory import Request
-from service.worker import Limits, Worker
+from service.worker import Worker
 from training.cli import load_recipe
 from training.export import unstopped
 
@@ -89,7 +89,7 @@ def served_on(
     """One request of N samples, whose rows a thread for each core shares, as the server has it."""
     manifest = read_manifest(bundle)
     engine = Engine(Runner(unstopped(manifest) if to_the_end else manifest, bundle))
-    worker = Worker(engine, threads=cores, limits=Limits(max_requests=1, max_rows=NUM_SAMPLES))
+    worker = Worker(engine, threads=cores, max_rows=NUM_SAMPLES)
     request = Request(
         observation=walking().astype(np.float32),
         num_samples=NUM_SAMPLES,

@@ -26,7 +26,7 @@ from service.catalog import Catalog
 from service.engine.engine import Engine
 from service.errors import UnknownModelError
 from service.settings import Settings
-from service.worker import Limits, Worker
+from service.worker import Worker
 
 CORES = len(os.sched_getaffinity(0))
 BODY = {"poses": walking(), "num_samples": 1}
@@ -141,7 +141,7 @@ def test_unforeseen_error_refuses_its_bundle_and_no_other(
     def breaks_once(engine: Engine) -> Worker:
         if engine.manifest.name == "diffusion":
             raise ZeroDivisionError
-        return Worker(engine, limits=Limits(max_requests=9, max_rows=99))
+        return Worker(engine, max_rows=99)
 
     catalog = Catalog(copies, default_model=None, worker=breaks_once)
     catalog.load()
