@@ -1,7 +1,9 @@
 """The application: settings in, an ASGI app out."""
 
 import asyncio
-from collections.abc import AsyncIterator
+import os
+import sys
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from functools import partial
 from operator import attrgetter
@@ -21,13 +23,20 @@ from service.sessions import Sessions
 from service.settings import Settings
 from service.telemetry import telemetry_config
 from service.visits import Visits
-from service.worker import Limits, Worker
+from service.warm_up import warm_up
+from service.worker import Worker
+
+NICENESS = 10
+"""How much nicer the threads that compute are than the event loop, which waits for no slice."""
 
 
-def create_app(settings: Settings | None = None) -> FastAPI:
+def create_app(
+    settings: Settings | None = None, *, once_ready: Callable[[], object] = lambda: None
+) -> FastAPI:
     """The service; without settings it reads those of the environment.
 
-    Bundles load in a thread of their own, so that the server answers /livez from the start.
+    Bundles load in a thread of their own, so that the server answers /livez from the start; it
+    calls ``once_ready`` when requests can be answered.
 
     Raises:
         ServiceError: it is configured for something that is not installed.
@@ -42,16 +51,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         worker=partial(
             Worker,
             threads=settings.num_workers,
-            limits=Limits(
-                max_requests=settings.max_queued_requests, max_rows=settings.max_queued_rows
-            ),
+            max_rows=settings.max_queued_rows,
             observer=metrics,
         ),
     )
 
     @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        loader = Thread(target=catalog.load, name="load-bundles", daemon=True)
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        work = [app, catalog, asyncio.get_running_loop(), once_ready]
+        loader = Thread(target=_load, args=work, name="load-bundles", daemon=True)
         loader.start()
         watch = asyncio.create_task(metrics.watch_event_loop())
         yield
@@ -100,6 +108,23 @@ async def drain(app: FastAPI) -> None:
     entries = app.state.catalog.entries.values()
     workers = [entry.worker for entry in entries if entry.worker is not None]
     await asyncio.gather(*(worker.drain(app.state.settings.drain_s) for worker in workers))
+
+
+def _load(
+    app: FastAPI,
+    catalog: Catalog,
+    loop: asyncio.AbstractEventLoop,
+    once_ready: Callable[[], object],
+) -> None:
+    """Load every bundle in this thread, whose priority all threads that compute inherit."""
+
+    def warmed_up() -> None:
+        asyncio.run_coroutine_threadsafe(warm_up(app, catalog), loop).result()
+        once_ready()
+
+    if sys.platform == "linux":  # elsewhere the whole process has one
+        os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
+    catalog.load(warmed_up)
 
 
 def _say_limits(app: FastAPI, settings: Settings) -> None:

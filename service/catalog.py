@@ -28,7 +28,7 @@ from service.errors import (
     UnknownModelError,
     UnsuitableModelError,
 )
-from service.worker import Limits, Worker
+from service.worker import Worker
 
 DEFAULT_FILE = "DEFAULT"
 GOLDEN_SAMPLES = 4
@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 
 def _unlimited(engine: Engine) -> Worker:
-    return Worker(engine, limits=Limits(max_requests=sys.maxsize, max_rows=sys.maxsize))
+    return Worker(engine, max_rows=sys.maxsize)
 
 
 @dataclass(kw_only=True, slots=True, eq=False)
@@ -84,6 +84,7 @@ class Catalog:
         self._threads = threads
         self._rows_per_step = rows_per_step
         self._worker = worker
+        self._is_loaded = False
         self.entries = {name: Entry(name=name) for name in bundle_names(folder)}
         names = [default_model] if default_model else _preferred(folder, list(self.entries))
         self._preferred = [self.entry(name) for name in names]
@@ -93,10 +94,10 @@ class Catalog:
 
     @property
     def state(self) -> Literal["loading", "ready", "unavailable"]:
-        """Ready once every bundle was tried and one can answer."""
-        states = {entry.state for entry in self.entries.values()}
-        if "loading" in states:
+        """Ready once every bundle was tried, one can answer, and what answers is warm."""
+        if not self._is_loaded:
             return "loading"
+        states = {entry.state for entry in self.entries.values()}
         return "ready" if "ready" in states else "unavailable"
 
     @property
@@ -105,14 +106,21 @@ class Catalog:
         entry = self.default(with_actions=False)
         return entry.name if entry else None
 
-    def load(self) -> None:
-        """Load every bundle, preferred ones first; a bundle that cannot be used is refused."""
+    def load(self, warm_up: Callable[[], object] = lambda: None) -> None:
+        """Load every bundle, preferred ones first, and warm up what is to answer with them.
+
+        A bundle that cannot be used is refused.
+        """
         for entry in dict.fromkeys([*self._preferred, *self.entries.values()]):
             if entry.state == "loading":
                 with _refused_on_error(entry):
                     self._load(entry)
             if entry.reason is not None:
                 _log.error("bundle %s is refused: %s", entry.name, entry.reason)
+        try:
+            warm_up()
+        finally:
+            self._is_loaded = True
 
     def default(self, *, with_actions: bool) -> Entry | None:
         """The bundle for requests that name none: the first that is preferred and ready.

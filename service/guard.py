@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from service import page
 from service.errors import OverloadedError, RateLimitedError, ServiceError, UnauthorisedError
 from service.problems import problem
+from service.visits import OWN
 
 OPEN_PATHS = ("/livez", "/readyz", page.PATH)
 RETRY_FRESH_S = 0.1
@@ -53,7 +54,7 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or answer 401 or 429."""
         app, computes = self._app, scope.get("method") == "POST"
-        if scope["type"] in ("http", "websocket") and not _is_open(scope["path"]):
+        if scope["type"] in ("http", "websocket") and not _is_open(scope):
             try:
                 caller = self._caller(scope)
                 if computes:
@@ -116,8 +117,9 @@ class Guard:
             )
 
 
-def _is_open(path: str) -> bool:
-    return path in OPEN_PATHS or path.startswith(f"{page.FILES_PATH}/")
+def _is_open(scope: Scope) -> bool:
+    path = scope["path"]
+    return path in OPEN_PATHS or path.startswith(f"{page.FILES_PATH}/") or OWN in scope["state"]
 
 
 def _digest(key: str) -> bytes:

@@ -15,6 +15,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.errors import ServiceError
 
 ID_HEADER = "X-Request-Id"
+OWN = "own"
+"""The key of a request's state by which it is the server's own: nobody counts or refuses it."""
 SWITCHED = 101
 CLIENT_GONE = 499  # no client sees it: nobody is there any more
 
@@ -63,7 +65,7 @@ class Visits:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer as the application does, with the header X-Request-Id."""
-        if scope["type"] not in ("http", "websocket"):
+        if scope["type"] not in ("http", "websocket") or OWN in scope.get("state", {}):
             await self._app(scope, receive, send)
             return
         asked = Headers(scope=scope).get(ID_HEADER, "")

@@ -37,14 +37,6 @@ class Timing:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Limits:
-    """The most requests and rows that may be under way; where none is, one request of any size."""
-
-    max_requests: int
-    max_rows: int
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class Load:
     """Requests and rows that wait or run; those of a caller who left count until they stop."""
 
@@ -91,18 +83,22 @@ class _Job:
 
 
 class Worker:
-    """Runs the requests of many callers on one engine, by several threads, until it is stopped."""
+    """Runs the requests of many callers on one engine, by several threads, until it is stopped.
+
+    At most ``max_rows`` of theirs are under way; where none is, one request of any size. How many
+    requests there may be is up to the guard, who counts them before they are read.
+    """
 
     def __init__(
         self,
         engine: Engine,
         *,
         threads: int = 1,
-        limits: Limits,
+        max_rows: int,
         observer: Observer | None = None,
     ) -> None:
         self._engine = engine
-        self._limits = limits
+        self._max_rows = max_rows
         self._observer = observer
         self._jobs: dict[int, _Job] = {}
         # Guards the jobs and the two flags; told of rows that wait, and of jobs that have ended.
@@ -231,14 +227,13 @@ class Worker:
         return request_id
 
     def _check_room(self, request: Request) -> None:
-        load, limits = self.load(), self._limits
-        requests = load.requests + 1 - limits.max_requests
-        rows = load.rows + request.num_samples - limits.max_rows
-        if load.requests and (requests > 0 or rows > 0):
+        load = self.load()
+        rows = load.rows + request.num_samples - self._max_rows
+        if load.requests and rows > 0:
             raise OverloadedError(
-                f"the server: found {load.requests} requests of {load.rows} samples under way; "
-                f"at most {limits.max_requests} and {limits.max_rows} may be.",
-                retry_after_s=self.seconds_until_free(requests=requests, rows=rows),
+                f"the server: found {load.rows} samples under way; it takes at most "
+                f"{self._max_rows}.",
+                retry_after_s=self.seconds_until_free(requests=0, rows=rows),
             )
 
     def _cancel(self, request_id: int) -> bool:

@@ -139,7 +139,9 @@ def table(rounds: list[Figures], *, peak_mb: float, start_s: float) -> list[Row]
         Row(name="one denoising step, of ten", wanted=0.25, value=mid["one_step"], form=times,
             sense="at most", note=f"{mid['one_step_engine_ms']:.1f} ms, compute"),
         Row(name=f"throughput, {CLIENTS} clients, against 1 / baseline", wanted=25,
-            value=mid["throughput"], form=faster, note=f"{mid['per_s']:.0f} requests/s"),
+            value=mid["throughput"], form=faster,
+            note=f"{mid['per_s']:.0f} requests/s; CPU time of each "
+            f"{mid['crowd_server_ms']:.1f} ms, of the load {mid['crowd_load_ms']:.1f} ms"),
         Row(name=f"p99 / p50 at {CLIENTS} clients of equal requests", wanted=1.3,
             value=mid["spread"], form=times, sense="at most",
             note=f"p50 {mid['crowd_p50_ms']:.0f} ms"),
@@ -149,13 +151,15 @@ def table(rounds: list[Figures], *, peak_mb: float, start_s: float) -> list[Row]
             f"{mid['step_ms']:.1f} ms; answered {mid['later_steps']:.1f} step times later than "
             "alone (median)"),
         Row(name="goodput at 10 x overload, of capacity", wanted=0.95, value=mid["goodput"],
-            form=percent, note=f"offered {mid['offered']:.1f} x"),
+            form=percent, note=f"offered {mid['offered']:.1f} x; the server has "
+            f"{mid['overload_server_s']:.2f} cores, the load {mid['overload_load_s']:.2f}"),
         Row(name="refusals that are a 429 with Retry-After", wanted=1.0, value=share["polite"],
             form=percent),
         Row(name="feasible deadlines met, on the client's clock", wanted=0.99,
             value=share["in_time"], form=percent,
             note=f"among {CLIENTS} others; from the p99 of a 1-step request to the p50 of a "
-            "ten-step one, in that crowd"),
+            "ten-step one, in that crowd; the client itself waits "
+            f"{mid['in_time_late_ms']:.1f} ms for a core for each answer"),
         Row(name="steps still computed after a disconnect", wanted=1, value=left, form=times,
             sense="at most",
             note=f"the worst, by the server's count; {LEAVING_SAMPLES} futures; since the client's "

@@ -3,10 +3,11 @@
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 import torch
-from benchmarks.rounds import medians
+from benchmarks.rounds import milliseconds
 from tiny_bundles import walking
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from models.system import Graph, Recipe
 from service.engine.engine import Engine
 from service.engine.runner import Runner
 from service.engine.trajectory import Request
-from service.worker import Limits, Worker
+from service.worker import Worker
 from training.cli import load_recipe
 from training.export import unstopped
 
@@ -26,7 +27,7 @@ FRAMES_PER_STEP = 5
 
 def table(bundle: Path, *, rounds: int, cores: int) -> list[tuple[str, float, str]]:
     """What ran, its milliseconds, and how often it fits into what."""
-    found = medians(
+    found = milliseconds(
         {
             "eager": stepped(load_recipe(RECIPE), frames_per_step=FRAMES_PER_STEP),
             "longest": served_on(bundle, num_actions=1, cores=cores, to_the_end=True),
@@ -36,18 +37,20 @@ def table(bundle: Path, *, rounds: int, cores: int) -> list[tuple[str, float, st
         },
         rounds=rounds,
     )
-    eager, one, name = found["eager"], found["one"], bundle.name
-    return [
-        ("one action in PyTorch eager, step by step to its longest", eager, "1"),
-        (
-            f"{name}, one action to its longest",
-            found["longest"],
-            f"{eager / found['longest']:.1f} x",
-        ),
-        (f"{name}, one action until it stops", one, f"{eager / one:.1f} x"),
-        (f"{name}, 2 actions", found["two"], f"{found['two'] / one:.1f} x one action"),
-        (f"{name}, 4 actions", found["four"], f"{found['four'] / one:.1f} x one action"),
-    ]
+    name = bundle.name
+
+    def ratio(above: str, below: str) -> float:
+        # Within a round, as a machine that drifts does so from round to round.
+        return median(a / b for a, b in zip(found[above], found[below], strict=True))
+
+    told = {
+        "one action in PyTorch eager, step by step to its longest": ("eager", "1"),
+        f"{name}, one action to its longest": ("longest", f"{ratio('eager', 'longest'):.1f} x"),
+        f"{name}, one action until it stops": ("one", f"{ratio('eager', 'one'):.1f} x"),
+        f"{name}, 2 actions": ("two", f"{ratio('two', 'one'):.1f} x one action"),
+        f"{name}, 4 actions": ("four", f"{ratio('four', 'one'):.1f} x one action"),
+    }
+    return [(what, median(found[side]), times) for what, (side, times) in told.items()]
 
 
 def stepped(recipe: Recipe, *, frames_per_step: int) -> Callable[[], Tensor]:
@@ -89,7 +92,7 @@ def served_on(
     """One request of N samples, whose rows a thread for each core shares, as the server has it."""
     manifest = read_manifest(bundle)
     engine = Engine(Runner(unstopped(manifest) if to_the_end else manifest, bundle))
-    worker = Worker(engine, threads=cores, limits=Limits(max_requests=1, max_rows=NUM_SAMPLES))
+    worker = Worker(engine, threads=cores, max_rows=NUM_SAMPLES)
     request = Request(
         observation=walking().astype(np.float32),
         num_samples=NUM_SAMPLES,

@@ -9,7 +9,7 @@ from typing import Any
 
 import httpx
 import numpy as np
-from benchmarks.load import Group, Reply, closed, leave, opened, request
+from benchmarks.load import Group, Reply, closed, leave, opened, request, spent
 from benchmarks.server import Server
 from tiny_bundles import walking
 
@@ -97,10 +97,9 @@ def _single(bench: Bench) -> Figures:
 def _crowd(bench: Bench, single: Figures) -> Figures:
     """Eight clients of equal requests, who each ask again as soon as they are answered."""
     probing = bench.prober.submit(closed, bench.throughput.port, [_livez()], bench.seconds)
-    loading = bench.loader.submit(
-        closed, bench.throughput.port, [Group(clients=CLIENTS, requests=[_ten()])], bench.seconds
-    )
-    [replies], [probes] = loading.result(), probing.result()
+    groups = [Group(clients=CLIENTS, requests=[_ten()])]
+    [replies], cost = _loaded(bench, closed, groups, bench.seconds)
+    [probes] = probing.result()
     seconds = _seconds(_good(replies))
     per_s = _per_s(replies, bench.seconds)
     return {
@@ -108,6 +107,8 @@ def _crowd(bench: Bench, single: Figures) -> Figures:
         "throughput": per_s * single["paper_ms"] / 1e3,
         "spread": float(np.quantile(seconds, 0.99) / np.median(seconds)),
         "crowd_p50_ms": 1e3 * float(np.median(seconds)),
+        "crowd_server_ms": 1e3 * cost.server_s / len(replies),
+        "crowd_load_ms": 1e3 * cost.load_s / len(replies),
         "livez_p99_ms": 1e3 * float(np.quantile(_seconds(_good(probes)), 0.99)),
     }
 
@@ -118,7 +119,7 @@ def _mixed(bench: Bench, single: Figures) -> Figures:
         Group(clients=CLIENTS, requests=[_ten()]),
         Group(clients=1, requests=[_asking(_body(num_steps=1))]),
     ]
-    tens, ones = bench.loader.submit(closed, bench.throughput.port, groups, bench.seconds).result()
+    (tens, ones), _ = _loaded(bench, closed, groups, bench.seconds)
     waits = [_stages_ms(reply.headers["server-timing"])["queue"] for reply in _good(ones)]
     seconds = _seconds(_good(ones))
     return {
@@ -136,21 +137,20 @@ def _deadlines(bench: Bench, mixed: Figures) -> Figures:
     deadlines = np.linspace(least, max(most, 1.5 * least), DEADLINES)
     asked = [_asking(_body(), x_request_timeout_seconds=f"{s:.6f}") for s in deadlines]
     groups = [Group(clients=CLIENTS, requests=[_ten()]), Group(clients=1, requests=asked)]
-    _, replies = bench.loader.submit(closed, bench.throughput.port, groups, bench.seconds).result()
+    (others, replies), cost = _loaded(bench, closed, groups, bench.seconds)
     met = [reply.status == 200 and reply.seconds <= deadlines[reply.which] for reply in replies]
-    return {"in_time": float(np.mean(met)), "timed": len(met)}
+    return {
+        "in_time": float(np.mean(met)),
+        "timed": len(met),
+        "in_time_late_ms": 1e3 * cost.waited_s / (len(others) + len(replies)),
+    }
 
 
 def _overloaded(bench: Bench, crowd: Figures) -> Figures:
     """Requests at ten times the rate of the eight clients, whatever the answers."""
     probing = bench.prober.submit(closed, bench.throughput.port, [_livez()], bench.seconds)
-    replies = bench.loader.submit(
-        opened,
-        bench.throughput.port,
-        _ten(),
-        per_s=OVERLOAD * crowd["per_s"],
-        seconds=bench.seconds,
-    ).result()
+    per_s = OVERLOAD * crowd["per_s"]
+    replies, cost = _loaded(bench, opened, _ten(), per_s=per_s, seconds=bench.seconds)
     [probes] = probing.result()
     refused = [reply for reply in replies if reply.status != 200]
     polite = [reply.status == 429 and "retry-after" in reply.headers for reply in refused]
@@ -158,6 +158,8 @@ def _overloaded(bench: Bench, crowd: Figures) -> Figures:
         "offered": len(replies) / bench.seconds / crowd["per_s"],
         "goodput": _per_s(replies, bench.seconds) / crowd["per_s"],
         "polite": float(np.mean(polite)) if polite else 1.0,
+        "overload_server_s": cost.server_s / cost.wall_s,
+        "overload_load_s": cost.load_s / cost.wall_s,
         "overloaded_livez_p99_ms": 1e3 * float(np.quantile(_seconds(_good(probes)), 0.99)),
     }
 
@@ -179,6 +181,29 @@ def _after_leaving(bench: Bench) -> Figures:
         since = max(since, (_rows_when_idle(server) - left) / LEAVING_SAMPLES)
         vain = max(vain, (server.metric(UNWANTED) - before) / LEAVING_SAMPLES)
     return {"steps_after_leaving": vain, "steps_since_look": since}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Cost:
+    """CPU seconds of both sides, and how long the load itself waited for a core."""
+
+    server_s: float
+    load_s: float
+    waited_s: float
+    wall_s: float
+
+
+def _loaded(bench: Bench, work: Callable[..., Any], *asked: Any, **how: Any) -> tuple[Any, _Cost]:
+    """What a load on the server gives, and what it costs."""
+    server = bench.throughput
+
+    def passed() -> tuple[float, ...]:
+        return server.cpu_s(), *bench.loader.submit(spent).result(), time.perf_counter()
+
+    before = passed()
+    found = bench.loader.submit(work, server.port, *asked, **how).result()
+    server_s, load_s, waited_s, wall_s = (b - a for a, b in zip(before, passed(), strict=True))
+    return found, _Cost(server_s=server_s, load_s=load_s, waited_s=waited_s, wall_s=wall_s)
 
 
 def _rows_when_idle(server: Server) -> float:

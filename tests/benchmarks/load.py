@@ -10,10 +10,13 @@ import re
 import time
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from pathlib import Path
+from typing import TypeVar, cast
+
+import uvloop
 
 NICENESS = 5
-LIMIT = 2**21  # bytes read ahead: a whole answer, so that reading is seldom paused
+READ_BYTES = 2**18
 PATIENCE_S = 60.0
 
 T = TypeVar("T")
@@ -44,6 +47,12 @@ def be_nice() -> None:
     os.nice(NICENESS)
 
 
+def spent() -> tuple[float, float]:
+    """CPU seconds of this process so far, and how long it could have run, but had no core."""
+    ran_and_waited = Path("/proc/self/schedstat").read_text().split()
+    return time.process_time(), int(ran_and_waited[1]) / 1e9
+
+
 def request(method: str, path: str, body: bytes = b"", **headers: str) -> bytes:
     """A request as it goes over the wire; the keyword ``content_type`` is a header's name."""
     fields = {"host": "127.0.0.1", "content-length": str(len(body))}
@@ -72,30 +81,69 @@ def leave(port: int, asked: bytes, *, metric: str, after: float) -> float:
 
 def _run(work: Coroutine[None, None, T], seconds: float) -> T:
     """What the work gives; a server that does not answer for long fails it."""
-    return asyncio.run(asyncio.wait_for(work, seconds + PATIENCE_S))
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        return runner.run(asyncio.wait_for(work, seconds + PATIENCE_S))
 
 
-class _Connection:
-    """Sends requests one after the other and reads whole answers."""
+class _Connection(asyncio.BufferedProtocol):
+    """Sends requests one after the other; of answers it keeps the head, and a body if asked to."""
 
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.reader, self.writer = reader, writer
+    def __init__(self, *, keeps: bool) -> None:
+        self._keeps = keeps
+        self._read = memoryview(bytearray(READ_BYTES))
+        self._head = b""
+        self._left = 0
+        self._status, self._headers = 0, dict[str, str]()
+        self._ended: asyncio.Future[None] | None = None
+        self.body = bytearray()
 
     @classmethod
-    async def to(cls, port: int) -> "_Connection":
-        return cls(*await asyncio.open_connection("127.0.0.1", port, limit=LIMIT))
-
-    async def head(self, asked: bytes) -> tuple[int, dict[str, str]]:
-        self.writer.write(asked)
-        first, *lines = (await self.reader.readuntil(b"\r\n\r\n")).decode().split("\r\n")
-        return int(first.split()[1]), dict(line.lower().split(": ", 1) for line in lines if line)
+    async def to(cls, port: int, *, keeps: bool = False) -> "_Connection":
+        loop = asyncio.get_running_loop()
+        _, connection = await loop.create_connection(lambda: cls(keeps=keeps), "127.0.0.1", port)
+        return connection
 
     async def reply(self, asked: bytes, which: int = 0) -> Reply:
         sent_s = time.perf_counter()
-        status, headers = await self.head(asked)
-        await self.reader.readexactly(int(headers.get("content-length", 0)))
-        seconds = time.perf_counter() - sent_s
-        return Reply(which=which, sent_s=sent_s, seconds=seconds, status=status, headers=headers)
+        self._ended = asyncio.get_running_loop().create_future()
+        self.body.clear()
+        self.transport.write(asked)
+        await self._ended
+        return Reply(
+            which=which,
+            sent_s=sent_s,
+            seconds=time.perf_counter() - sent_s,
+            status=self._status,
+            headers=self._headers,
+        )
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast(asyncio.Transport, transport)  # which uvloop's does not inherit
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        del sizehint
+        return self._read
+
+    def buffer_updated(self, nbytes: int) -> None:
+        part: bytes | memoryview = self._read[:nbytes]
+        if not self._left:
+            head, end, part = (self._head + part).partition(b"\r\n\r\n")
+            if not end:
+                self._head = head
+                return
+            first, *lines = head.decode().split("\r\n")
+            self._head, self._status = b"", int(first.split()[1])
+            self._headers = dict(line.lower().split(": ", 1) for line in lines)
+            self._left = int(self._headers.get("content-length", 0))
+        self._left -= len(part)
+        if self._keeps:
+            self.body += part
+        if not self._left and self._ended:
+            self._ended.set_result(None)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._ended and not self._ended.done():
+            self._ended.set_exception(exc or ConnectionResetError("closed before its answer"))
 
 
 async def _closed(port: int, groups: Sequence[Group], until_s: float) -> list[list[Reply]]:
@@ -106,7 +154,7 @@ async def _closed(port: int, groups: Sequence[Group], until_s: float) -> list[li
             which = len(replies) % len(group.requests)
             replies.append(await connection.reply(group.requests[which], which))
             await asyncio.sleep(group.pause_s)
-        connection.writer.close()
+        connection.transport.close()
         return replies
 
     async def together(group: Group) -> list[Reply]:
@@ -126,7 +174,7 @@ async def _opened(port: int, asked: bytes, *, per_s: float, seconds: float) -> l
             connection = idle.pop() if idle else await _Connection.to(port)
             replies.append(await connection.reply(asked))
             idle.append(connection)
-        except (OSError, asyncio.IncompleteReadError):
+        except OSError:
             seconds = time.perf_counter() - sent_s
             replies.append(Reply(which=0, sent_s=sent_s, seconds=seconds, status=0, headers={}))
 
@@ -139,22 +187,22 @@ async def _opened(port: int, asked: bytes, *, per_s: float, seconds: float) -> l
                 sent += 1
             await asyncio.sleep(0.002)
     for connection in idle:
-        connection.writer.close()
+        connection.transport.close()
     return replies
 
 
 async def _left(port: int, asked: bytes, metric: str, after: float) -> float:
-    leaver, watcher = await _Connection.to(port), await _Connection.to(port)
+    leaver, watcher = await _Connection.to(port), await _Connection.to(port, keeps=True)
 
     async def value() -> float:
-        _, headers = await watcher.head(request("GET", "/metrics"))
-        text = await watcher.reader.readexactly(int(headers["content-length"]))
-        return sum(map(float, re.findall(rf"(?m)^{metric}(?:{{.*}})? (\S+)$", text.decode())))
+        await watcher.reply(request("GET", "/metrics"))
+        found = re.findall(rf"(?m)^{metric}(?:{{.*}})? (\S+)$", watcher.body.decode())
+        return sum(map(float, found))
 
     before = now = await value()
-    leaver.writer.write(asked)
+    leaver.transport.write(asked)
     while now < before + after:
         now = await value()
-    leaver.writer.transport.abort()
-    watcher.writer.close()
+    leaver.transport.abort()
+    watcher.transport.close()
     return now

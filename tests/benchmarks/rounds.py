@@ -1,12 +1,11 @@
 """Interleaved rounds, so that a noisy neighbour slows all sides alike."""
 
-import statistics
 import time
 from collections.abc import Callable
 
 
-def medians(sides: dict[str, Callable[[], object]], *, rounds: int) -> dict[str, float]:
-    """Median milliseconds of each side over interleaved rounds."""
+def milliseconds(sides: dict[str, Callable[[], object]], *, rounds: int) -> dict[str, list[float]]:
+    """Of each side, how long it took in each of the interleaved rounds."""
     times: dict[str, list[float]] = {name: [] for name in sides}
     for index in range(rounds + 1):
         for name, run in sides.items():
@@ -15,4 +14,4 @@ def medians(sides: dict[str, Callable[[], object]], *, rounds: int) -> dict[str,
             run()
             if index:  # the first round warms up
                 times[name].append(1e3 * (time.perf_counter() - started))
-    return {name: statistics.median(values) for name, values in times.items()}
+    return times

@@ -1,5 +1,6 @@
 """A real server in a process of its own."""
 
+import os
 import re
 import socket
 import subprocess
@@ -35,6 +36,11 @@ class Server:
         found = re.search(r"VmHWM:\s+(\d+) kB", status)
         assert found, status
         return int(found[1]) / 1000
+
+    def cpu_s(self) -> float:
+        """The CPU seconds of the process so far."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def metric(self, name: str) -> float:
         """A metric of the server, summed over its labels."""

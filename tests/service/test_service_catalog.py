@@ -1,6 +1,9 @@
 import json
 import os
 import shutil
+import sys
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 
@@ -18,12 +21,12 @@ from tiny_bundles import (
 )
 
 from models.bundle import read_manifest
-from service.app import create_app
+from service.app import NICENESS, create_app
 from service.catalog import Catalog
 from service.engine.engine import Engine
 from service.errors import UnknownModelError
 from service.settings import Settings
-from service.worker import Limits, Worker
+from service.worker import Worker
 
 CORES = len(os.sched_getaffinity(0))
 BODY = {"poses": walking(), "num_samples": 1}
@@ -138,7 +141,7 @@ def test_unforeseen_error_refuses_its_bundle_and_no_other(
     def breaks_once(engine: Engine) -> Worker:
         if engine.manifest.name == "diffusion":
             raise ZeroDivisionError
-        return Worker(engine, limits=Limits(max_requests=9, max_rows=99))
+        return Worker(engine, max_rows=99)
 
     catalog = Catalog(copies, default_model=None, worker=breaks_once)
     catalog.load()
@@ -191,13 +194,26 @@ def test_server_without_bundles_is_alive_and_not_ready(tmp_path: Path, folder: s
         assert "no bundle" in response.json()["detail"]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have no priority of their own")
+def test_threads_that_compute_leave_the_cores_to_the_event_loop(bundles: Path):
+    before = set(threading.enumerate())
+    with Service.of(bundles, workers=2) as service:
+        service.wait_until_loaded()
+        others = set(threading.enumerate()) - before
+        computing = [thread for thread in others if thread.name.startswith("engine-")]
+        priorities = {os.getpriority(os.PRIO_PROCESS, t.native_id or 0) for t in computing}
+        own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    assert len(computing) == 4
+    assert priorities == {own + NICENESS}
+
+
 def test_only_loading_makes_a_server_unready(bundles: Path, monkeypatch: pytest.MonkeyPatch):
     may_load = Event()
     load = Catalog.load
 
-    def held(catalog: Catalog) -> None:
+    def held(catalog: Catalog, *warm_up: Callable[[], object]) -> None:
         may_load.wait()
-        load(catalog)
+        load(catalog, *warm_up)
 
     monkeypatch.setattr(Catalog, "load", held)
     with Service.of(bundles) as service:
@@ -211,6 +227,17 @@ def test_only_loading_makes_a_server_unready(bundles: Path, monkeypatch: pytest.
         service.wait_until_loaded()
         assert service.get("/readyz").status_code == 200
         assert service.post(BODY).status_code == 200
+
+
+def test_who_waits_for_a_server_is_told_once_that_it_is_ready(bundles: Path):
+    told: list[float] = []
+    settings = Settings(bundles=bundles, threads=1)
+    app = create_app(settings, once_ready=lambda: told.append(1.0))
+    with Service(app) as service:
+        assert told == []
+        service.wait_until_loaded()
+        assert service.post(BODY).status_code == 200
+        assert told == [1.0]
 
 
 def test_settings_come_from_the_environment(bundles: Path, monkeypatch: pytest.MonkeyPatch):

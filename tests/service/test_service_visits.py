@@ -45,24 +45,29 @@ def fresh(bundles: Path) -> Iterator[Service]:
 
 
 def test_metrics_count_what_happened(fresh: Service):
+    own = samples(fresh)  # of the request that warmed the server up, only what the engine did
     posted(fresh)
     posted(fresh, num_steps=4)
     posted(fresh, num_samples=0)
     posted(fresh, deadline_ms=1e-6)
     found = samples(fresh)
+
+    def steps(kind: str) -> float:
+        return found[name := ("motion_steps_total", "diffusion", kind)] - own[name]
+
     for outcome, count in {"ok": 2.0, "invalid": 1.0, "deadline": 1.0}.items():
         assert found["motion_requests_total", "/predict", outcome] == count
     assert found["motion_request_duration_seconds_count", "/predict"] == 4.0
-    assert found["motion_steps_total", "diffusion", "planned"] == 20.0
-    assert found["motion_steps_total", "diffusion", "done"] == 14.0
-    assert found["motion_steps_total", "diffusion", "skipped"] == 6.0
-    assert found["motion_queue_wait_seconds_count", "diffusion"] == 2.0
+    assert steps("planned") == 20.0
+    assert steps("done") == 14.0
+    assert steps("skipped") == 6.0
+    assert found["motion_queue_wait_seconds_count", "diffusion"] == 3.0
     assert found["motion_step_duration_seconds_count", "diffusion"] >= 10.0
     assert found["motion_batch_rows_count", "diffusion"] >= 10.0
     assert found["motion_batch_dispatch_seconds_count", "diffusion"] >= 10.0
     assert found["motion_rows_unwanted_total", "diffusion"] == 0.0
     assert found["motion_golden_check", "diffusion"] == 1.0
-    assert found["motion_encode_seconds_count", "application/json"] == 2.0
+    assert found["motion_encode_seconds_count", "application/json"] == 3.0
     assert found["motion_queue_requests", "diffusion"] == 0.0
     assert found["motion_queue_rows", "diffusion"] == 0.0
     assert found["motion_engine_heartbeat_age_seconds", "diffusion"] == 0.0
@@ -70,6 +75,24 @@ def test_metrics_count_what_happened(fresh: Service):
     assert found["motion_event_loop_lag_seconds",] >= 0.0
     assert found["process_resident_memory_bytes",] > 0.0
     assert sum(name[0] == "motion_model_info" for name in found) == 2
+
+
+def test_server_that_is_ready_has_answered_a_request_of_its_own_which_nobody_counts(
+    bundles: Path, caplog: pytest.LogCaptureFixture
+):
+    caplog.set_level(logging.INFO)
+    with Service.of(bundles, api_keys="secret", rate_limit="1/minute") as service:
+        service.wait_until_loaded()
+        headers = JSON | {"authorization": "Bearer secret"}
+        told = service.request("GET", "/metrics", headers=headers).text
+        body = dumped({"poses": POSES, "num_samples": 1})
+        answers = [
+            service.request("POST", "/predict", content=body, headers=headers) for _ in range(2)
+        ]
+    assert 'motion_queue_wait_seconds_count{model="diffusion"} 1.0' in told
+    assert "motion_requests_total{" not in told
+    assert [answer.status_code for answer in answers] == [200, 429]
+    assert not [line for line in lines(caplog) if line.get("request_id") == "own"]
 
 
 def test_paths_that_are_not_there_share_one_label(fresh: Service):

@@ -29,12 +29,12 @@ from service.errors import (
     ServiceError,
     UnavailableError,
 )
-from service.worker import Limits, Load, Timing, Worker
+from service.worker import Load, Timing, Worker
 
 WALK = Request(observation=walking().astype(np.float32), num_samples=2)
 HUGE = replace(WALK, num_samples=2000)
 TOO_FAST = replace(WALK, observation=walking(speed=99.0).astype(np.float32))
-AMPLE = Limits(max_requests=1000, max_rows=100_000)
+AMPLE = 100_000  # rows
 IDLE = Load(requests=0, rows=0)
 
 
@@ -118,9 +118,9 @@ def start(runner: HeldRunner, recorder: Recorder) -> Iterator[Callable[..., Work
     """Starts workers, which are idle and stopped in the end."""
     workers: list[Worker] = []
 
-    def started(*, limits: Limits = AMPLE, threads: int = 2, rows_per_step: int = 64) -> Worker:
+    def started(*, max_rows: int = AMPLE, threads: int = 2, rows_per_step: int = 64) -> Worker:
         engine = Engine(runner, rows_per_step=rows_per_step)
-        workers.append(Worker(engine, threads=threads, limits=limits, observer=recorder))
+        workers.append(Worker(engine, threads=threads, max_rows=max_rows, observer=recorder))
         return workers[-1]
 
     yield started
@@ -247,13 +247,10 @@ def test_request_is_cancelled_by_its_key(
     assert recorder.outcomes == ["cancelled", "finished"]
 
 
-@pytest.mark.parametrize(
-    "limits", [Limits(max_requests=2, max_rows=1000), Limits(max_requests=99, max_rows=5)]
-)
 def test_more_than_may_be_under_way_is_refused_at_once(
-    start: Callable[..., Worker], runner: HeldRunner, recorder: Recorder, limits: Limits
+    start: Callable[..., Worker], runner: HeldRunner, recorder: Recorder
 ):
-    worker = start(limits=limits)
+    worker = start(max_rows=5)
     run(worker.predict(WALK, answer))  # from which it learns what a request takes
     runner.may_run.clear()
 
@@ -272,7 +269,7 @@ def test_more_than_may_be_under_way_is_refused_at_once(
 
 
 def test_single_request_is_taken_however_large(start: Callable[..., Worker]):
-    worker = start(limits=Limits(max_requests=1, max_rows=1))
+    worker = start(max_rows=1)
     assert run(worker.predict(replace(WALK, num_samples=100), answer))
 
 
@@ -439,7 +436,7 @@ class HurriedEngine(Engine):
 
 def test_draining_hands_over_what_is_ready_at_its_end(runner: HeldRunner):
     engine = HurriedEngine(runner)
-    worker = Worker(engine, limits=AMPLE)
+    worker = Worker(engine, max_rows=AMPLE)
     reasons: list[tuple[str, int]] = []
 
     def noted(result: Result, _: Timing) -> bytes:
@@ -476,7 +473,7 @@ class Submissions(RuleBasedStateMachine):
         self.worker = Worker(
             Engine(self.runner, rows_per_step=8),
             threads=2,
-            limits=Limits(max_requests=6, max_rows=60),
+            max_rows=60,
             observer=self.recorder,
         )
         self.loop = asyncio.Runner()
