@@ -12,7 +12,7 @@ from fastapi import FastAPI
 
 from service import files, live, predictions, validation
 from service.catalog import Catalog
-from service.guard import Guard
+from service.guard import KEY_PROTOCOL, STREAM_PROTOCOL, Guard
 from service.metrics import Metrics
 from service.page import add_page
 from service.problems import add_problem_responses
@@ -22,6 +22,11 @@ from service.settings import Settings
 from service.telemetry import telemetry_config
 from service.visits import Visits
 from service.worker import Limits, Worker
+
+KEY_OF_STREAMS = (
+    "In browsers, which cannot set this header for WS /stream, the WebSocket offers the protocols "
+    f"`{STREAM_PROTOCOL}` and `{KEY_PROTOCOL}` before the key in base64url without padding."
+)
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -118,7 +123,7 @@ def _say_limits(app: FastAPI, settings: Settings) -> None:
             seconds["maximum"] = settings.max_horizon_s
             if settings.api_keys:
                 document["components"]["securitySchemes"] = {
-                    "key": {"type": "http", "scheme": "bearer"}
+                    "key": {"type": "http", "scheme": "bearer", "description": KEY_OF_STREAMS}
                 }
                 document["security"] = [{"key": []}]
         return app.openapi_schema or {}
