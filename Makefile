@@ -3,6 +3,7 @@
 # make lint         run the checks alone
 # make format       rewrite the code as `make lint` wants it
 # make page         build the page and its client from web/ into service/viewer; needs Node.js
+# make webcam       put MediaPipe and its model into web/mediapipe, for the page's webcam; needs Node.js
 # make bench        measure the server and write docs/benchmark.md; BENCH=--quick only prints
 # make clean        remove caches and build outputs; keeps .venv, runs and stores
 
@@ -14,7 +15,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: serve test lint format page bench clean
+.PHONY: serve test lint format page webcam bench clean
 
 serve: $(VENV)/.core
 	@$(BIN)/posefutures serve --port $(PORT)
@@ -36,6 +37,9 @@ page: $(VENV)/.core
 	cd web && npm ci --no-audit --no-fund
 	$(BIN)/python web/openapi.py > web/openapi.json
 	cd web && npm run client && npm run check && npm run build
+
+webcam:
+	cd web && npm ci --no-audit --no-fund && npm run webcam
 
 bench: $(VENV)/.dev
 	@PYTHONPATH=tests $(BIN)/python -m benchmarks $(BENCH)

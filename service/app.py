@@ -14,7 +14,7 @@ from fastapi import FastAPI
 
 from service import files, live, predictions, validation
 from service.catalog import Catalog
-from service.guard import Guard
+from service.guard import KEY_PROTOCOL, STREAM_PROTOCOL, Guard
 from service.metrics import Metrics
 from service.page import add_page
 from service.problems import add_problem_responses
@@ -28,6 +28,11 @@ from service.worker import Worker
 
 NICENESS = 10
 """How much nicer the threads that compute are than the event loop, which waits for no slice."""
+
+KEY_OF_STREAMS = (
+    "In browsers, which cannot set this header for WS /stream, the WebSocket offers the protocols "
+    f"`{STREAM_PROTOCOL}` and `{KEY_PROTOCOL}` before the key in base64url without padding."
+)
 
 
 def create_app(
@@ -143,7 +148,7 @@ def _say_limits(app: FastAPI, settings: Settings) -> None:
             seconds["maximum"] = settings.max_horizon_s
             if settings.api_keys:
                 document["components"]["securitySchemes"] = {
-                    "key": {"type": "http", "scheme": "bearer"}
+                    "key": {"type": "http", "scheme": "bearer", "description": KEY_OF_STREAMS}
                 }
                 document["security"] = [{"key": []}]
         return app.openapi_schema or {}

@@ -5,6 +5,9 @@ The client says ``start``, and then ``frame`` after ``frame``; the server says `
 Messages of text are JSON, of bytes MessagePack; the server's are as the ``start`` was. At most one
 prediction of a connection is under way, of the latest frames when it begins, and only when the one
 before it has been sent: nothing queues up, however slowly it is read.
+
+Where the server wants a key, browsers, which cannot set ``Authorization`` here, offer two
+protocols: ``posefutures``, which is taken, and ``posefutures.bearer.`` before the key in base64url.
 """
 
 import asyncio
@@ -26,6 +29,7 @@ from service.errors import (
     ServiceError,
     UnavailableError,
 )
+from service.guard import STREAM_PROTOCOL
 from service.media import JSON, MSGPACK, decoded, encoded
 from service.observation import frames_needed
 from service.poses import poses_array, shown
@@ -59,7 +63,8 @@ async def stream(socket: WebSocket) -> None:
     streams.add(socket)
     connection = _Connection(socket)
     try:
-        await socket.accept()
+        offered = socket.scope["subprotocols"]
+        await socket.accept(STREAM_PROTOCOL if STREAM_PROTOCOL in offered else None)
         await connection.run()
     finally:
         streams.discard(socket)

@@ -1,6 +1,7 @@
 """A WebSocket to the application in memory, whose client reads only when a test does."""
 
 import asyncio
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,20 @@ def nulled(pose: np.ndarray) -> list[Any]:
 class Stream:
     """An async context manager; ``said()`` is the next message of the server."""
 
-    def __init__(self, app: FastAPI, *, path: str = "/stream", key: str | None = None) -> None:
+    def __init__(
+        self,
+        app: FastAPI,
+        *,
+        path: str = "/stream",
+        key: str | None = None,
+        protocols: Sequence[str] = (),
+    ) -> None:
         headers = [] if key is None else [(b"authorization", f"Bearer {key}".encode())]
         self._scope = {
             "type": "websocket", "path": path, "raw_path": path.encode(), "headers": headers,
             "query_string": b"", "scheme": "ws", "client": ("test", 1), "server": ("service", 80),
-            "subprotocols": [], "extensions": {"websocket.http.response": {}}, "state": {},
+            "subprotocols": list(protocols), "extensions": {"websocket.http.response": {}},
+            "state": {},
         }  # fmt: skip
         self._app = app
         self._to_app: asyncio.Queue[dict[str, Any]] = asyncio.Queue()

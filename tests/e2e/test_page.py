@@ -1,101 +1,45 @@
 """The page in a real browser, before a real server with the bundles that ship."""
 
 import base64
-import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
-from live import until
+from browsing import (
+    DESK,
+    Server,
+    chromium,
+    needs_chromium,
+    open_page,
+    running,
+    slide,
+    sync_api,
+)
 from tiny_bundles import walking
 
 from models.motion.formats.bvh import write_bvh
 from models.motion.formats.files import read_motion
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21
-from service.settings import Settings
 
-sync_api = pytest.importorskip("playwright.sync_api")
 expect = sync_api.expect
 
-CHROMIUM = shutil.which("chromium")
-FLAGS = (  # software rendering, as the machines of a CI have no GPU
-    "--no-sandbox",
-    "--disable-dev-shm-usage",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-)
-START_S, PATIENCE_MS = 240.0, 60_000  # a gate's machine may be busy
-DESK = {"width": 900, "height": 600}
-ANSWERED = "#timing[data-futures]"
-
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
-
-
-class Server:
-    """`posefutures serve` on one and the same port, however often it is started."""
-
-    def __init__(self, bundles: Path) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
-        self.url = f"http://127.0.0.1:{self.port}"
-        self._bundles = bundles
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def start(self) -> None:
-        program = [sys.executable, "-c", "from service.cli import app; app()"]
-        self._process = subprocess.Popen(
-            [
-                "env",
-                f"POSEFUTURES_BUNDLES={self._bundles}",
-                *program,
-                "serve",
-                f"--port={self.port}",
-            ],
-            stderr=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        )
-        until(self._is_ready, patience_s=START_S)
-
-    def stop(self) -> None:
-        if self._process is not None:
-            self._process.terminate()
-            self._process.wait()
-
-    def _is_ready(self) -> bool:
-        try:
-            return httpx.get(f"{self.url}/readyz").is_success
-        except httpx.TransportError:
-            return False
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """Serves the two bundles that answer by default."""
-    shipped, folder = Settings().bundles, tmp_path_factory.mktemp("bundles")
-    shutil.copy(shipped / "DEFAULT", folder)
-    for name in (shipped / "DEFAULT").read_text().split():
-        (folder / name).symlink_to(shipped / name)
-    running = Server(folder)
-    try:
-        running.start()
-        yield running
-    finally:
-        running.stop()
+    with running(tmp_path_factory.mktemp("bundles")) as server:
+        yield server
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator["sync_api.Browser"]:
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield chromium
-        chromium.close()
+    with chromium() as browser:
+        yield browser
 
 
 @pytest.fixture(scope="module")
@@ -109,23 +53,10 @@ def opened(
     browser: "sync_api.Browser", server: Server, complaints: list[str]
 ) -> Iterator["sync_api.Page"]:
     """The page as it opens: futures are on it, and nothing is wrong."""
-    context = browser.new_context(
-        viewport=DESK,
-        device_scale_factor=0.5,  # a quarter of the pixels: a CPU draws them
-        reduced_motion="reduce",
-        permissions=["clipboard-read", "clipboard-write"],
-        base_url=server.url,
-    )
-    page = context.new_page()
-    page.set_default_timeout(PATIENCE_MS)
-    expect.set_options(timeout=PATIENCE_MS)
-    page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.on("console", lambda said: said.type == "error" and complaints.append(said.text))
-    page.goto("/")
-    page.locator(ANSWERED).wait_for()
-    assert complaints == []
-    yield page
-    context.close()
+    permissions = ["clipboard-read", "clipboard-write"]
+    with open_page(browser, server, complaints, permissions=permissions) as page:
+        assert complaints == []
+        yield page
 
 
 @pytest.fixture
@@ -143,14 +74,6 @@ def page(opened: "sync_api.Page", complaints: list[str]) -> "sync_api.Page":
     expect(opened.locator("#motion-text")).to_contain_text("stroll")
     opened.locator('#timing[data-futures="20"][data-seed="7"]').wait_for()
     return opened
-
-
-def slide(page: "sync_api.Page", slider: str, value: float) -> None:
-    """What a hand does to a slider."""
-    page.locator(slider).evaluate(
-        "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input')) }",
-        value,
-    )
 
 
 def seek(page: "sync_api.Page", seconds: float) -> None:
@@ -326,3 +249,4 @@ def test_it_fits_a_phone_and_the_keyboard_reaches_the_controls(page):
 def test_without_mediapipe_the_webcam_says_which_files_are_missing(page):
     page.click("#webcam")
     expect(page.locator("#notice-text")).to_contain_text("POSEFUTURES_POSE_LANDMARKER")
+    expect(page.locator("#notice-text")).to_contain_text("vision_bundle.mjs")

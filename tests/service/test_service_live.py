@@ -1,6 +1,7 @@
 """WS /stream: what goes in and out of it, and that nothing of it piles up."""
 
 import asyncio
+from base64 import urlsafe_b64encode
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,6 +16,7 @@ from live import Live, until
 from tiny_bundles import FPS, walking
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from service.app import drain
 
@@ -416,6 +418,57 @@ def test_streams_need_a_key_and_there_are_so_many(strict: Service):
     assert headers[b"retry-after"] == b"1"
 
 
+KEY = "k\N{LATIN SMALL LETTER SHARP S}/+ ?~\N{SNOWMAN}"
+
+
+def key_protocol(key: str) -> str:
+    return "posefutures.bearer." + urlsafe_b64encode(key.encode()).decode().rstrip("=")
+
+
+@pytest.mark.parametrize(
+    ("protocols", "status"),
+    [
+        (["posefutures", key_protocol(KEY)], 101),
+        ([key_protocol(KEY), "posefutures"], 101),
+        (["posefutures", key_protocol("wrong")], 401),
+        (["posefutures", "posefutures.bearer."], 401),
+        (["posefutures", "posefutures.bearer.A"], 401),
+        (["posefutures", "posefutures.bearer._w"], 401),
+        (["posefutures", "posefutures.bearer.k"], 401),
+        (["posefutures"], 401),
+        ([], 401),
+    ],
+)
+def test_browsers_give_their_key_as_a_protocol(bundles: Path, protocols: list[str], status: int):
+    with Service.of(bundles, api_keys=KEY) as running:
+        running.wait_until_loaded()
+
+        async def opened() -> dict[str, Any]:
+            async with Stream(running.app, protocols=protocols) as stream:
+                return stream.opening
+
+        opening = running.run(opened())
+    assert opening.get("status", 101) == status
+    assert opening.get("subprotocol") == ("posefutures" if status == 101 else None)
+
+
+def test_a_header_counts_before_a_protocol(strict: Service):
+    async def opened() -> dict[str, Any]:
+        async with Stream(strict.app, key="wrong", protocols=[key_protocol("k")]) as stream:
+            return stream.opening
+
+    assert strict.run(opened())["status"] == 401
+
+
+def test_a_protocol_that_nobody_offers_is_not_taken(service: Service):
+    async def opened() -> dict[str, Any]:
+        async with Stream(service.app, protocols=["graphql-ws"]) as stream:
+            return stream.opening
+
+    opening = service.run(opened())
+    assert (opening["type"], opening["subprotocol"]) == ("websocket.accept", None)
+
+
 def test_answers_count_at_the_rate_of_the_caller(strict: Service):
     async def streamed() -> dict[str, Any]:
         async with Stream(strict.app, key="k") as stream:
@@ -474,6 +527,9 @@ def test_real_strangers_get_a_problem(bundles: Path):
             connect(url)
         assert refused.value.response.status_code == 401
         assert orjson.loads(refused.value.response.body)["type"] == "/problems/unauthorised"
+        browsers = [Subprotocol("posefutures"), Subprotocol(key_protocol("k"))]
+        with connect(url, subprotocols=browsers) as socket:
+            assert socket.subprotocol == "posefutures"
         with connect(url, additional_headers={"authorization": "Bearer k"}) as socket:
             socket.send(orjson.dumps({"type": "start"}).decode())
             assert orjson.loads(socket.recv())["type"] == "ready"

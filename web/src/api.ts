@@ -48,6 +48,14 @@ export function useKey(wanted: string): void {
 /** What goes with each request. */
 export const headers = (): Record<string, string> => (key ? { Authorization: `Bearer ${key}` } : {});
 
+/** What goes with a WebSocket, of which browsers let no more be said: its name, and a key in base64url. */
+export function protocols(): string[] {
+  if (!key) return [];
+  const text = btoa(String.fromCharCode(...new TextEncoder().encode(key)));
+  const safe = text.replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+  return ["posefutures", `posefutures.bearer.${safe}`];
+}
+
 interface Reply<T> {
   data?: T;
   error?: unknown;

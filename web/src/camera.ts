@@ -5,6 +5,7 @@ import type { Point } from "./motion";
 
 const FOLDER = "/viewer/mediapipe";
 const BUNDLE = `${FOLDER}/vision_bundle.mjs`;
+const MODEL = `${FOLDER}/pose_landmarker.task`;
 
 export interface Camera {
   stop: () => void;
@@ -12,13 +13,14 @@ export interface Camera {
 
 /** Throws, in a sentence for people, where the operator has not added MediaPipe's files. */
 export async function checkFiles(): Promise<void> {
-  const found = await fetch(BUNDLE, { method: "HEAD" }).catch(() => null);
-  if (found?.ok) return;
-  throw new Error(
-    "The webcam needs MediaPipe, which this server does not have. Who runs it puts " +
-      "vision_bundle.mjs and wasm/ of @mediapipe/tasks-vision 1.1.0 (`npm run webcam` in web/) and " +
-      "Google's model pose_landmarker.task into a folder, and names that in POSEFUTURES_POSE_LANDMARKER.",
-  );
+  for (const file of [BUNDLE, MODEL]) {
+    const found = await fetch(file, { method: "HEAD" }).catch(() => null);
+    if (found?.ok) continue;
+    throw new Error(
+      `The webcam needs MediaPipe, of which this server does not have ${file.slice(FOLDER.length + 1)}. ` +
+        "Who runs it gets the files by `make webcam` and names their folder in POSEFUTURES_POSE_LANDMARKER.",
+    );
+  }
 }
 
 /**
@@ -36,7 +38,7 @@ export async function openCamera(
     const landmarker = await PoseLandmarker.createFromOptions(
       await FilesetResolver.forVisionTasks(`${FOLDER}/wasm`),
       {
-        baseOptions: { modelAssetPath: `${FOLDER}/pose_landmarker.task`, delegate: "GPU" },
+        baseOptions: { modelAssetPath: MODEL, delegate: "GPU" },
         runningMode: "VIDEO",
         numPoses: 1,
       },
@@ -66,6 +68,9 @@ export async function openCamera(
 }
 
 async function camera(): Promise<MediaStream> {
+  if (!navigator.mediaDevices) {
+    throw new Error("Browsers give no camera to this page: it must come over https, or from localhost.");
+  }
   try {
     return await navigator.mediaDevices.getUserMedia({ video: { width: 640, height: 480 } });
   } catch (cause) {

@@ -1,12 +1,14 @@
 /** Frames to WS /stream, futures of the latest back; a lost connection goes on where it was. */
 
 import type { PredictResponse, Problem } from "../client";
+import { protocols } from "./api";
 import type { Point } from "./motion";
 
 const AGAIN_MS = 1000;
 
 interface LiveNews {
-  futures: (answer: PredictResponse) => void;
+  /** Of frames until `seconds`. */
+  futures: (answer: PredictResponse, seconds: number) => void;
   waiting: (haveSeconds: number, needSeconds: number) => void;
   problem: (problem: Problem) => void;
   lost: () => void;
@@ -14,7 +16,7 @@ interface LiveNews {
 
 type Message =
   | { type: "ready"; session: string }
-  | { type: "futures"; answer: PredictResponse }
+  | { type: "futures"; t: number; answer: PredictResponse }
   | { type: "waiting"; have_s: number; need_s: number }
   | { type: "error"; problem: Problem };
 
@@ -43,7 +45,7 @@ export class Live {
   }
 
   private connect(): void {
-    const socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/stream`);
+    const socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/stream`, protocols());
     this.socket = socket;
     socket.addEventListener("open", () => this.start());
     socket.addEventListener("message", ({ data }) => this.hear(JSON.parse(data as string) as Message));
@@ -66,6 +68,6 @@ export class Live {
     if (message.type === "ready") this.session = message.session;
     else if (message.type === "waiting") this.news.waiting(message.have_s, message.need_s);
     else if (message.type === "error") this.news.problem(message.problem);
-    else this.news.futures(message.answer);
+    else this.news.futures(message.answer, message.t);
   }
 }

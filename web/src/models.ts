@@ -72,7 +72,7 @@ export class Models {
       ["Sees", seconds(seen)],
       [detail.actions?.length ? "At most, for an action" : "Predicts", seconds(horizon)],
       ["Rate", fps ? `${fps} Hz` : ""],
-      ["Denoising steps", steps ? String(steps) : ""],
+      ["Denoising steps", steps && steps > 1 ? String(steps) : ""],
       ["Digest", (detail.digest ?? "").slice(0, 12)],
       ["Owed to", (detail.attribution ?? []).join(" ")],
     ];

@@ -17,7 +17,7 @@ import { Server } from "./server";
 import { DEMOS, demo, fromFiles } from "./sources";
 import { Stage } from "./stage";
 import { asCurl, asPython, type Question, save, type Suffix } from "./take";
-import { tellAnswer, tellMotion, tellRegions } from "./telling";
+import { tellAnswer, tellMotion, tellRegions, tellWebcam } from "./telling";
 import { Timeline } from "./timeline";
 import { type Solo, View } from "./view";
 import { Webcam } from "./webcam";
@@ -84,17 +84,23 @@ function offerModels(): void {
 /** Watch the webcam, or stop watching it. */
 async function watch(): Promise<void> {
   if (webcam) return stopWatching();
-  webcam = new Webcam();
+  loads++; // a motion that is still being read would end it
+  const mine = (webcam = new Webcam());
   button("webcam").setAttribute("aria-pressed", "true");
+  element("motion-text").textContent = "The camera is coming…";
   input("ask-predict").click();
   try {
-    await webcam.start(element<HTMLVideoElement>("video"), options(models.current), {
+    await mine.start(element<HTMLVideoElement>("video"), options(models.current), {
       moved: sawFrame,
-      answered: (found, axes: Axes) => show(api.answerOf(found, axes, performance.now()), now),
+      answered: (found, axes: Axes, seen) => {
+        show(api.answerOf(found, axes, seen), now);
+        notice.hide("answer");
+      },
       waiting: (text) => (element("timing").textContent = text),
-      failed: fail,
+      failed: (error) => fail(error, "answer"),
     });
   } catch (error) {
+    if (mine !== webcam) return; // nobody waits for it any more
     stopWatching();
     fail(error);
   }
@@ -117,7 +123,7 @@ function sawFrame(found: Motion): void {
   timeline.set({ fps: found.fps, frames: found.track.frames }, now, answer);
   timeline.player.time = timeline.nowSeconds + ahead;
   if (first) {
-    element("motion-text").textContent = "You, as the camera sees you; nothing is stored.";
+    tellWebcam();
     view.setMotion(found, now);
     showPlaying();
   } else view.replaceMotion(found, now);
@@ -319,6 +325,7 @@ function listen(): void {
   button("play").addEventListener("click", play);
   for (const radio of document.querySelectorAll("input[name=ask]")) {
     radio.addEventListener("change", () => {
+      if (performing()) stopWatching(); // what is told begins where the camera saw the person last
       offerModels();
       void ask();
     });

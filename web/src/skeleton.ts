@@ -5,10 +5,14 @@ export interface Skeleton {
   parents: number[];
 }
 
+const [LEFT, RIGHT] = [/^l|left|[_.:]l/i, /^r|right|[_.:]r/i];
+const WRIST = [/wrist/i, /hand$/i];
+const HIP = [/hip(?!s)/i, /up_?leg/i, /thigh|upper_?leg/i];
+
 /** Indices of the joints whose regions are shown: root, head and both wrists. */
 export function watched({ joints, parents }: Skeleton): number[] {
   const root = Math.max(0, parents.indexOf(-1));
-  const found = [root, headOf(joints), wristOf(joints, /^l|left|[_.:]l/i), wristOf(joints, /^r|right|[_.:]r/i)];
+  const found = [root, headOf(joints), jointOf(joints, WRIST, LEFT), jointOf(joints, WRIST, RIGHT)];
   return [...new Set(found.filter((joint) => joint >= 0))];
 }
 
@@ -18,8 +22,14 @@ export function headOf(joints: string[]): number {
   return head >= 0 ? head : joints.findIndex((name) => /nose|head/i.test(name));
 }
 
-function wristOf(joints: string[], side: RegExp): number {
-  for (const part of [/wrist/i, /hand$/i]) {
+/** Both hips, of which a person in between looks ahead; null where they are not named so. */
+export function hipsOf(joints: string[]): [left: number, right: number] | null {
+  const [left, right] = [jointOf(joints, HIP, LEFT), jointOf(joints, HIP, RIGHT)];
+  return left >= 0 && right >= 0 ? [left, right] : null;
+}
+
+function jointOf(joints: string[], parts: RegExp[], side: RegExp): number {
+  for (const part of parts) {
     const found = joints.findIndex((name) => part.test(name) && side.test(name));
     if (found >= 0) return found;
   }

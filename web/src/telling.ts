@@ -7,8 +7,15 @@ import type { Motion } from "./motion";
 
 export function tellMotion({ name, fps, track }: Motion): void {
   const seconds = (track.frames / fps).toFixed(1);
-  element("motion-text").textContent =
-    `${name}: ${seconds} s, ${track.joints} joints at ${Number(fps.toFixed(2))} Hz`;
+  tellSource(name, `${name}: ${seconds} s, ${track.joints} joints at ${Number(fps.toFixed(2))} Hz`);
+}
+
+export function tellWebcam(): void {
+  tellSource("webcam", "You, as the camera sees you; nothing is stored.");
+}
+
+function tellSource(name: string, text: string): void {
+  element("motion-text").textContent = text;
   element("timing").removeAttribute("data-futures"); // there are none of it yet
   for (const chip of element("demos").children) {
     chip.setAttribute("aria-pressed", String((chip as HTMLElement).dataset.demo === name));

@@ -6,7 +6,7 @@ import { Figures } from "./figures";
 import { groundOf, type Motion, poseAt, type Track } from "./motion";
 import type { Palette } from "./palette";
 import { RegionBalls } from "./regions";
-import { watched } from "./skeleton";
+import { hipsOf, watched } from "./skeleton";
 import type { Stage } from "./stage";
 import { type Trail, Trails } from "./trails";
 
@@ -227,7 +227,15 @@ export class View {
     return new Vector3(pose[at], pose[at + 1], this.ground + 0.92);
   }
 
-  /** Where the person has gone in the last second, else where it goes next, as an angle. */
+  /** Across the line from the right hip to the left. */
+  private ahead(): Vector3 {
+    const hips = this.motion && hipsOf(this.motion.skeleton.joints);
+    if (!hips) return new Vector3(1, 0, 0);
+    const [left, right] = hips.map((joint) => this.nowPose.subarray(joint * 3, joint * 3 + 2));
+    return new Vector3(left[1] - right[1], right[0] - left[0], 0);
+  }
+
+  /** Where the person has gone in the last second, else where it goes next or looks, as an angle. */
   private heading(): number {
     if (!this.motion) return 0;
     const { track, fps } = this.motion;
@@ -236,6 +244,7 @@ export class View {
     const here = this.rootOf(this.nowPose);
     const way = here.clone().sub(before);
     if (way.length() < 0.1) way.copy(this.rootOf(poseAt(track, this.now + 2 * fps, other))).sub(here);
-    return way.length() < 0.1 ? 0 : Math.atan2(way.y, way.x);
+    if (way.length() < 0.1) way.copy(this.ahead());
+    return Math.atan2(way.y, way.x);
   }
 }

@@ -10,12 +10,13 @@ import { FixedBones, OneEuro } from "./smoothing";
 
 const SKELETON = "mediapipe33";
 const AXES: Axes = { up: "-y", units: "m" };
-const FPS = 30; // about what cameras give; the server goes by the times of the frames
+const FPS = 30; // of the futures
 const KEPT_FRAMES = 60;
 
 export interface WebcamNews {
   moved: (motion: Motion) => void;
-  answered: (answer: PredictResponse, axes: Axes) => void;
+  /** Of a picture that was seen at `milliseconds` of the page. */
+  answered: (answer: PredictResponse, axes: Axes, milliseconds: number) => void;
   waiting: (text: string) => void;
   failed: (error: unknown) => void;
 }
@@ -23,21 +24,24 @@ export interface WebcamNews {
 export class Webcam {
   private camera: Camera | null = null;
   private live: Live | null = null;
-  private poses: Point[][] = [];
+  private seen: { pose: Point[]; seconds: number }[] = [];
+  private ended = false;
 
   /** Begin, with what is asked of each prediction; throws where there is no camera. */
   async start(video: HTMLVideoElement, options: object, news: WebcamNews): Promise<void> {
     await checkFiles();
     const skeleton = await skeletonOf(SKELETON);
     const [calm, bones] = [new OneEuro(), new FixedBones(skeleton.parents)];
-    this.camera = await openCamera(video, (points, seconds) => {
+    const camera = await openCamera(video, (points, seconds) => {
       const pose = grounded(bones.fit(calm.filter(points, seconds)));
-      this.poses = [...this.poses.slice(1 - KEPT_FRAMES), pose];
+      this.seen = [...this.seen.slice(1 - KEPT_FRAMES), { pose, seconds }];
       this.live?.frame(pose, seconds);
-      news.moved(motionOf(this.poses, skeleton));
+      news.moved(this.motion(skeleton));
     });
+    if (this.ended) return camera.stop(); // while the camera was still coming
+    this.camera = camera;
     this.live = new Live(asked(options), {
-      futures: (answer) => news.answered(answer, AXES),
+      futures: (answer, seconds) => news.answered(answer, AXES, seconds * 1000),
       waiting: (have, need) => news.waiting(`watching: ${have.toFixed(1)} of ${need.toFixed(1)} s`),
       problem: (problem) => news.failed(new api.ProblemError(problem)),
       lost: () => news.failed(new api.AwayError("The live connection was lost.")),
@@ -48,7 +52,16 @@ export class Webcam {
     this.live?.ask(asked(options));
   }
 
+  /** At the rate at which poses came: cameras, and what finds people in their pictures, are slow or fast. */
+  private motion(skeleton: Skeleton): Motion {
+    const poses = this.seen.map(({ pose }) => pose);
+    const passed = this.seen[this.seen.length - 1].seconds - this.seen[0].seconds;
+    const fps = passed > 0 ? Math.round((poses.length - 1) / passed) || 1 : FPS;
+    return { name: "webcam", poses, fps, axes: AXES, named: SKELETON, skeleton, track: trackOf(poses, AXES) };
+  }
+
   stop(): void {
+    this.ended = true;
     this.live?.end();
     this.camera?.stop();
   }
@@ -60,11 +73,6 @@ const asked = (options: object) => ({ ...options, skeleton: SKELETON, axes: AXES
 function grounded(pose: Point[]): Point[] {
   const lowest = Math.max(...pose.map(([, down]) => down));
   return pose.map(([x, down, z]) => [x, down - lowest, z]);
-}
-
-function motionOf(poses: Point[][], skeleton: Skeleton): Motion {
-  const track = trackOf(poses, AXES);
-  return { name: "webcam", poses, fps: FPS, axes: AXES, named: SKELETON, skeleton, track };
 }
 
 async function skeletonOf(wanted: string): Promise<Skeleton> {
