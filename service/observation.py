@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import ceil, floor
+from math import ceil
 from typing import Any, Literal
 
 import numpy as np
@@ -11,7 +11,15 @@ from jaxtyping import Bool, Float, Shaped
 
 from models.bundle import Manifest
 from models.motion.axes import Axes
-from models.motion.gaps import MIN_CONFIDENCE, at_even_times, even_rate, filled, steadied, trusted
+from models.motion.gaps import (
+    MIN_CONFIDENCE,
+    at_even_times,
+    even_rate,
+    filled,
+    num_even,
+    steadied,
+    trusted,
+)
 from models.motion.kinematics import bone_lengths
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21, Skeleton, SkeletonError, joint_map, resolve_joints
@@ -213,7 +221,7 @@ def frames_needed(manifest: Manifest, fps: float) -> int:
 def _check_length(seen: Seen, fps: float, manifest: Manifest) -> None:
     found, needed = len(seen.world), frames_needed(manifest, fps)
     if seen.times is not None and found > 1:
-        found = floor((seen.times[-1] - seen.times[0]) * fps + 0.5) + 1
+        found = num_even(float(seen.times[-1] - seen.times[0]), fps)
     if found < needed:
         seconds = manifest.num_observed / manifest.fps
         raise TooFewFramesError(
@@ -258,15 +266,15 @@ def _whole(recent: Seen, fps: float) -> tuple[Float[np.ndarray, "T J 3"], list[s
     ]
     times = np.arange(frames) / fps if recent.times is None else recent.times
     world = filled(world, times, parents)
-    if recent.confidence is not None:
-        world = steadied(world, np.where(seen, recent.confidence, 0.0), fps)
+    worth = None if recent.confidence is None else np.where(seen, recent.confidence, 0.0)
     if recent.times is not None:
         if (longest := float(np.diff(times).max())) > LONG_GAP_S:
             warnings.append(
                 f"timestamps: {longest:.2f} s lie between two frames; filled with a straight line."
             )
         world = at_even_times(world, times, fps)
-    return world, warnings
+        worth = None if worth is None else at_even_times(worth, times, fps)
+    return world if worth is None else steadied(world, worth, fps), warnings
 
 
 def body_weights(

@@ -502,6 +502,9 @@ class StreamFrame(_Body):
     type: Literal["frame"]
     t: float = Field(allow_inf_nan=False, description="seconds on any clock, later each time")
     pose: list[Any] | InstanceOf[np.ndarray]
+    confidence: list[Any] | InstanceOf[np.ndarray] | None = Field(
+        default=None, description="[joints], as POST /predict has it for each frame"
+    )
 
 
 class ActionSegment(_Body):
