@@ -107,7 +107,7 @@ class Denoiser:
         manifest = self._manifest
         num_samples = request.num_samples if self._schedule else 1
         steps = manifest.timesteps(request.num_steps)
-        whole = len(steps) == manifest.chain_steps(request.num_steps)
+        wanted = min(manifest.default_steps, manifest.chain_steps(request.num_steps))
         horizon = request.horizon or manifest.horizon
         parts = Denoising(
             request_id=request_id,
@@ -116,7 +116,7 @@ class Denoiser:
             context=Context(tensors={"observation": request.observation[None]}),
             timesteps=steps,
             num_legs=-(-horizon // manifest.horizon),
-            stopped_by="end" if whole else "num_steps",
+            stopped_by="end" if len(steps) >= wanted else "num_steps",
             past=np.empty((num_samples, 0, len(manifest.skeleton.joints), 3), np.float32),
         )
         return [parts]

@@ -138,6 +138,22 @@ def test_stride_walks_the_whole_chain_in_fewer_steps(
     assert (result.steps_run, result.steps_of, result.stopped_by) == (len(chain), len(chain), "end")
 
 
+@pytest.mark.parametrize(
+    ("num_steps", "run", "stopped_by"),
+    [(None, 3, "end"), (2, 2, "num_steps"), (3, 3, "end"), (5, 5, "end")],
+)
+def test_only_who_asks_for_fewer_steps_than_the_default_is_told_so(
+    bundles: Path, num_steps: int | None, run: int, stopped_by: str
+):
+    folder = bundles / "diffusion"
+    manifest = read_manifest(folder)
+    assert manifest.schedule is not None
+    plan = manifest.schedule.model_copy(update={"default_steps": 3})
+    runner = Runner(manifest.model_copy(update={"schedule": plan}), folder, threads=1)
+    result = predict(Engine(runner), request(7, num_steps=num_steps))
+    assert (result.steps_run, result.steps_of, result.stopped_by) == (run, 10, stopped_by)
+
+
 def test_same_seed_gives_the_same_bytes_and_another_seed_another_future(bundles: Path):
     engine = engine_of(bundles / "diffusion")
     first, again, other = (futures(engine, request(seed)) for seed in (5, 5, 6))
