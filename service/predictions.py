@@ -4,7 +4,6 @@ import asyncio
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil
 from time import perf_counter
 from typing import Annotated, Any
 
@@ -97,13 +96,12 @@ _FILES = {
     ZIP: _described("where a file was accepted and num_samples is more: one for each future"),
 }
 _EVENTS = _described(
-    "accepted {id, model, seed, steps.of}, preview {id, steps, futures} after each step, final "
-    "(the plain JSON), end; or an error instead of what is left; a stream without end is not "
-    "complete"
+    "accepted {id, model, seed, steps.of}, preview {id, steps, futures} after each step, or each "
+    "chunk of frames of actions, final (the plain JSON), end; or an error instead of what is left; "
+    "a stream without end is not complete"
 )
 _BODIES = {"requestBody": {"content": _BINARY}}
-_ANSWERS: dict[int | str, dict[str, Any]] = {200: {"content": _BINARY | _FILES}}
-_ANSWERS_OR_EVENTS: dict[int | str, dict[str, Any]] = {
+_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"content": _BINARY | _FILES | dict.fromkeys(STREAMS, _EVENTS)}
 }
 
@@ -112,14 +110,14 @@ _ANSWERS_OR_EVENTS: dict[int | str, dict[str, Any]] = {
     "/v1/predict",
     operation_id="predict_v1",
     response_model=schemas.PredictResponse,
-    responses=_PROBLEMS | _ANSWERS_OR_EVENTS,
+    responses=_PROBLEMS | _ANSWERS,
     openapi_extra=_BODIES,
 )
 @router.post(
     "/predict",
     operation_id="predict",
     response_model=schemas.PredictResponse,
-    responses=_PROBLEMS | _ANSWERS_OR_EVENTS,
+    responses=_PROBLEMS | _ANSWERS,
     openapi_extra=_BODIES,
 )
 async def predict(
@@ -165,7 +163,7 @@ async def predict_actions(
     timeout_s: _TimeoutHeader = None,
 ) -> Response:
     """N futures of the person in the poses, who performs the actions one after the other."""
-    media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *MOTIONS))
+    media_type = accepted(http.headers.get("accept", ""), (*DOCUMENTS, *STREAMS, *MOTIONS))
     _check_returned(body.returned, media_type)
     _query(body, body.returned)
     manifest, worker = catalog.ready(body.model, with_actions=True)
@@ -183,6 +181,7 @@ async def predict_actions(
         stop_threshold_m=body.stop_threshold,
         max_frames=longest,
         deadline_s=deadline_of(body, arrived_s=visit_of(http).arrived_s, timeout_s=timeout_s),
+        previews=media_type in STREAMS,
     )
     answer = Answer(
         id=visit_of(http).request_id,
@@ -409,8 +408,7 @@ async def _streamed(
         body = answer.final(result, timing)
         return event("final", body, media_type) + event("end", b"{}", media_type)
 
-    legs = ceil((request.horizon or 1) / answer.manifest.horizon)
-    plan = {"steps": {"of": legs * answer.manifest.chain_steps(request.num_steps)}}
+    plan = {"steps": {"of": worker.steps_of(request)}}
     events = worker.stream(request, final, preview, request_key=answer.id)
     streams.add(answer)
 

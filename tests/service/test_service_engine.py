@@ -3,11 +3,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice, zip_longest
 from pathlib import Path
-from threading import Thread
 
 import numpy as np
 import onnxruntime as ort
 import pytest
+from threaded import run_by_threads
 from tiny_bundles import NUM_STEPS, X_T_SHAPE, walking
 
 from models.bundle import read_manifest
@@ -82,25 +82,6 @@ def slow_obvious_future(
         )
     feed = {"x0": x0[None], "context": context, "observation": observation[None]}
     return graph["decoder"].run(None, feed)[0][0]
-
-
-def run_by_threads(
-    engine: Engine, requests: Sequence[Request], *, threads: int
-) -> list[list[Result | Failure | Preview]]:
-    """What became of each request."""
-    events: dict[int, list[Result | Failure | Preview]] = {engine.add(r): [] for r in requests}
-
-    def drive() -> None:
-        while engine.num_requests:
-            for event in engine.turn(shares=threads).events:
-                events[event.request_id].append(event)
-
-    drivers = [Thread(target=drive) for _ in range(threads)]
-    for driver in drivers:
-        driver.start()
-    for driver in drivers:
-        driver.join()
-    return list(events.values())
 
 
 @pytest.mark.parametrize("num_steps", [1, 4, NUM_STEPS])
