@@ -20,6 +20,7 @@ from models.motion.gaps import (
     steadied,
     trusted,
 )
+from models.motion.guesses import body_of
 from models.motion.kinematics import bone_lengths
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21, Skeleton, SkeletonError, joint_map, resolve_joints
@@ -28,6 +29,7 @@ from service.errors import PosesError, TooFewFramesError, UnknownSkeletonError
 from service.person import check_person
 from service.poses import confidence_array, poses_array, times_array
 from service.skeletons import OwnJoints, own_skeleton, sent_order
+from service.stance import Finding, stance
 
 Source = Literal["observed", "derived", "imputed"]
 
@@ -168,6 +170,8 @@ def observe(seen: Seen, *, axes: Axes, fps: float, manifest: Manifest) -> Observ
     window = window[-num_frames - 1 :]
     is_seen = np.isfinite(window[0, :, 0])
     weights, guessed = body_weights(skeleton, is_seen, target)
+    body = body_of(window[:, is_seen], without_joints(skeleton, is_seen))
+    odd = [_warning(finding) for finding in stance(body, axes)]
     root = np.matmul(weights[0], window[-1, is_seen])
     lowest = float(window[-1, is_seen, 2].min())
     offset = np.array([root[0], root[1], lowest if abs(lowest) > MAX_HEIGHT_M else 0.0])
@@ -189,7 +193,13 @@ def observe(seen: Seen, *, axes: Axes, fps: float, manifest: Manifest) -> Observ
         sources=sources(recent),
     )
     positions = _at_rate(mapped, fps, manifest).astype(np.float32)
-    return Observation(positions=positions, caller=caller, warnings=(*warnings, *guessed))
+    return Observation(positions=positions, caller=caller, warnings=(*warnings, *guessed, *odd))
+
+
+def _warning(finding: Finding) -> str:
+    """A finding about how the body stands, as an answer says it."""
+    where = "poses" if finding.about == "sides" else f"axes.{finding.about}"
+    return f"{where}: {finding.sentence[0].lower()}{finding.sentence[1:]}"
 
 
 def sources(seen: Seen) -> tuple[Source, ...]:
