@@ -15,6 +15,7 @@ from jaxtyping import Float, Shaped
 from pydantic import ValidationError
 
 from models.bundle import BundleError
+from models.motion.bones import with_fixed_bones
 from models.motion.formats.errors import FormatError
 from models.motion.formats.files import SUFFIXES, WRITTEN_SUFFIXES, read_motion, write_motion
 from models.motion.gaps import without_gaps
@@ -171,6 +172,12 @@ def convert(
         str | None, typer.Option(help="a standard skeleton to put it on; its own by default")
     ] = None,
     fps: Annotated[float | None, typer.Option(min=1, max=1000, help="frames per second")] = None,
+    fix_bones: Annotated[
+        bool,
+        typer.Option(
+            "--fix-bones", help="give each bone the median of its lengths, as for a webcam"
+        ),
+    ] = False,
 ) -> None:
     """Write the motion in a file as a file of another kind."""
     with _one_line_errors():
@@ -179,6 +186,8 @@ def convert(
             motion = without_gaps(motion).to(standard_skeleton(skeleton))
         if fps is not None:
             motion = without_gaps(motion).resample(fps)
+        if fix_bones:
+            motion = with_fixed_bones(without_gaps(motion))
         write_motion(out, motion)
         typer.echo(
             f"{motion.num_frames} frames of {motion.skeleton.num_joints} joints at "

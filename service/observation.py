@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from math import ceil
 from typing import Any, Literal
 
@@ -11,6 +10,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from models.bundle import Manifest
 from models.motion.axes import Axes
+from models.motion.bones import bone_parents
 from models.motion.gaps import (
     MIN_CONFIDENCE,
     at_even_times,
@@ -23,7 +23,7 @@ from models.motion.gaps import (
 from models.motion.guesses import body_of
 from models.motion.kinematics import bone_lengths
 from models.motion.motion import Motion
-from models.motion.skeleton import BODY21, Skeleton, SkeletonError, joint_map, resolve_joints
+from models.motion.skeleton import Skeleton, SkeletonError, joint_map
 from models.motion.trees import without_joints
 from service.errors import PosesError, TooFewFramesError, UnknownSkeletonError
 from service.person import check_person
@@ -35,7 +35,6 @@ Source = Literal["observed", "derived", "imputed"]
 
 MIN_FPS, MAX_FPS = 5.0, 300.0
 LONG_GAP_S = 0.25
-MAX_BONES = 3  # of body21, that move as one
 MAX_HEIGHT_M = 10.0  # of the lowest joint over z = 0; above, it is brought down to the ground
 
 
@@ -188,7 +187,7 @@ def observe(seen: Seen, *, axes: Axes, fps: float, manifest: Manifest) -> Observ
         offset=offset,
         last_pose=near[-1],
         bones=np.median(bone_lengths(near[-num_frames:], skeleton.parents), axis=0),
-        bone_parents=_bone_parents(skeleton, fixed),
+        bone_parents=bone_parents(skeleton, loose=np.flatnonzero(fixed).tolist()),
         fixed=fixed,
         sources=sources(recent),
     )
@@ -330,39 +329,6 @@ def _fixed(near: Float[np.ndarray, "T J 3"], used: Sequence[int]) -> Bool[np.nda
     fixed = (moved < 1e-3) & (moved[list(used)].min() > 1e-2)
     fixed[list(used)] = False
     return np.asarray(fixed)
-
-
-def _bone_parents(skeleton: Skeleton, fixed: Bool[np.ndarray, "J"]) -> tuple[int, ...]:
-    """Parents, or -1 where no bone joins them to their child: above the hips, fixed, far off."""
-    loose = {int(joint) for joint in np.flatnonzero(fixed)}
-    hips = resolve_joints(skeleton).get("hips", skeleton.joints[0])
-    over = skeleton.parents[skeleton.index(hips)]
-    while over >= 0:
-        loose.add(over)
-        over = skeleton.parents[over]
-    return tuple(
-        parent if near and not {joint, parent} & loose else -1
-        for joint, (parent, near) in enumerate(zip(skeleton.parents, _near(skeleton), strict=True))
-    )
-
-
-@lru_cache(maxsize=256)
-def _near(skeleton: Skeleton) -> tuple[bool, ...]:
-    """Whether each joint is so near to its parent in the body that a bone may join them.
-
-    From a shoulder to a hip, as where there is no trunk, is no bone.
-    """
-    nearest = joint_map(BODY21, skeleton)[0].argmax(axis=1)
-    lines = []
-    for joint in map(int, nearest):
-        line = {joint}
-        while (joint := BODY21.parents[joint]) >= 0:
-            line.add(joint)
-        lines.append(line)
-    return tuple(
-        len(lines[joint] ^ lines[parent]) <= MAX_BONES
-        for joint, parent in enumerate(skeleton.parents)
-    )
 
 
 def _at_rate(
