@@ -29,8 +29,8 @@ from service.errors import (
 )
 from service.media import JSON, MSGPACK, decoded, encoded
 from service.observation import frames_needed
+from service.plans import Plan, deadline_of, planned, prepared, seed_of
 from service.poses import confidence_array, poses_array, shown
-from service.predictions import Plan, deadline_of, planned, prepared, seed_of
 from service.problems import content_of, field_error, problem
 from service.schemas import PredictRequest, StreamFrame, StreamStart
 from service.sessions import Frame, Session, Watch
