@@ -452,7 +452,11 @@ class Distance(_Body):
 
 
 class Occupancy(_Body):
-    """What the futures say of one region; shares of samples, which no measurement has widened."""
+    """What the futures say of one region: shares of the samples, not measured probabilities.
+
+    Samples are surer than people are, and no calibration widens them here: a region that none of
+    them enters may be entered. Measured regions are those of `quantiles`, where `calibrated`.
+    """
 
     probability: list[Any] = Field(description="[frames]: of those that last so long, in it then")
     num_lasting: list[int] = Field(description="[frames]: how many futures last so long")
