@@ -57,10 +57,11 @@ class Answer:
         started_s = perf_counter()
         caller = self.observation.caller
         in_world = self._in_world(result.futures, result.segments)
-        segments = caller_segments(result.segments, manifest=self.manifest, fps=caller.fps)
-        performs = self.manifest.actions is not None
+        segments = self._caller_segments(result.segments)
         part = (
-            self._performed(in_world, segments) if performs else self._continued(in_world, result)
+            self._performed(in_world, segments)
+            if self._performs
+            else self._continued(in_world, result)
         )
         names = dict(zip(caller.order, caller.skeleton.joints, strict=True))
         sources = dict(zip(caller.order, caller.sources, strict=True))
@@ -105,9 +106,14 @@ class Answer:
 
     def preview(self, preview: Preview) -> bytes:
         """Futures as they stand after a step."""
-        futures = written(self._in_world(preview.futures), self.observation.caller)
+        in_world = self._in_world(preview.futures, preview.segments)
+        futures = (
+            self._lasting(in_world, self._caller_segments(preview.segments))
+            if self._performs
+            else np.ascontiguousarray(written(in_world, self.observation.caller))
+        )
         steps = {"run": preview.steps_run, "of": preview.steps_of}
-        content = {"id": self.id, "steps": steps, "futures": np.ascontiguousarray(futures)}
+        content = {"id": self.id, "steps": steps, "futures": futures}
         return encoded(content, self.media_type)
 
     def head(self) -> dict[str, Any]:
@@ -131,6 +137,13 @@ class Answer:
             bone_lengths=self.bone_lengths,
             segments=segments,
         )
+
+    @property
+    def _performs(self) -> bool:
+        return self.manifest.actions is not None
+
+    def _caller_segments(self, segments: Sequence[Sequence[Segment]]) -> list[list[Segment]]:
+        return caller_segments(segments, manifest=self.manifest, fps=self.observation.caller.fps)
 
     def _continued(self, in_world: Float[np.ndarray, "N H J 3"], result: Result) -> dict[str, Any]:
         content: dict[str, Any] = {"num_frames": in_world.shape[1]}
@@ -199,29 +212,33 @@ class Answer:
     def _performed(
         self, in_world: Float[np.ndarray, "N H J 3"], segments: Sequence[Sequence[Segment]]
     ) -> dict[str, Any]:
-        """Each future as long as its actions took, and the frames of each action in it."""
-        caller = self.observation.caller
-        labels = self.manifest.actions.labels if self.manifest.actions else ()
-        ends = [parts[-1].end for parts in segments]
+        """Each future as long as its actions took, and what of them was asked for beside."""
         content: dict[str, Any] = {}
         if "futures" in self.returned:
-            content["futures"] = [
-                {
-                    "num_frames": end,
-                    "poses": np.ascontiguousarray(future[:end]),
-                    "segments": [
-                        {
-                            "action": labels[part.action],
-                            "start": part.start,
-                            "end": part.end,
-                            "stopped": part.stopped,
-                        }
-                        for part in parts
-                    ],
-                }
-                for future, parts, end in zip(
-                    written(in_world, caller), segments, ends, strict=True
-                )
-            ]
+            content["futures"] = self._lasting(in_world, segments)
+        ends = [parts[-1].end for parts in segments]
         lasting = [future[:end] for future, end in zip(in_world, ends, strict=True)]
         return content | self._occupancy(lasting)
+
+    def _lasting(
+        self, in_world: Float[np.ndarray, "N H J 3"], segments: Sequence[Sequence[Segment]]
+    ) -> list[dict[str, Any]]:
+        """Each future as long as its actions took, and the frames of each action in it."""
+        labels = self.manifest.actions.labels if self.manifest.actions else ()
+        futures = written(in_world, self.observation.caller)
+        return [
+            {
+                "num_frames": parts[-1].end,
+                "poses": np.ascontiguousarray(future[: parts[-1].end]),
+                "segments": [
+                    {
+                        "action": labels[part.action],
+                        "start": part.start,
+                        "end": part.end,
+                        "stopped": part.stopped,
+                    }
+                    for part in parts
+                ],
+            }
+            for future, parts in zip(futures, segments, strict=True)
+        ]

@@ -1,19 +1,17 @@
 """What is odd about an observation, each thing in one plain sentence."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from models.motion.axes import UNITS_PER_METRE, Axes
+from models.motion.axes import Axes
 from models.motion.gaps import filled
-from models.motion.guesses import LEGS_M, body_of, guess_units, guess_up, leg_length
+from models.motion.guesses import Body, body_of
 from models.motion.trees import without_joints
 from service.observation import Seen, sources
-
-About = Literal["units", "up", "sides", "joints", "frozen", "limbs", "teleport", "path"]
+from service.stance import Finding, guessed_axes, stance, turned
 
 LIMBS = tuple(
     (f"{side}_{upper}", f"{side}_{lower}")
@@ -29,16 +27,6 @@ MAX_LIMB_NOISE = 0.03  # standard deviation of a bone's length, of its mean
 MAX_SPEED_M_S = 12.0  # of the hips: what the fastest sprinter reaches
 STILL_M = 1e-6
 
-_Body = Mapping[str, np.ndarray]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Finding:
-    """Something odd: what it is about, and a sentence that says it."""
-
-    about: About
-    sentence: str
-
 
 def whole(seen: Seen) -> Seen:
     """The joints that were ever seen, without gaps in time."""
@@ -49,51 +37,14 @@ def whole(seen: Seen) -> Seen:
     return replace(seen, world=world, skeleton=tree)
 
 
-def guessed_axes(seen: Seen, axes: Axes) -> Axes:
-    """The up axis and the unit that whole poses look like."""
-    raw = axes.from_metres(seen.world)
-    return Axes(
-        up=guess_up(raw, seen.skeleton),
-        units=guess_units(leg_length(raw, seen.skeleton)),
-        handed=axes.handed,
-    )
-
-
 def findings(seen: Seen, axes: Axes, fps: float) -> list[Finding]:
     """All that is odd; beyond the axes, as if those were what the poses look like."""
     filled_in = whole(seen)
-    looks = guessed_axes(filled_in, axes)
-    found = [*_units(filled_in, axes, looks), *_up(axes, looks), *_joints(seen)]
-    upright = looks.to_metres(axes.from_metres(filled_in.world))
-    body = body_of(upright, filled_in.skeleton)
+    body = body_of(filled_in.world, filled_in.skeleton)
+    found = [*stance(body, axes), *_joints(seen), *_frozen(seen)]
+    upright = turned(body, axes, guessed_axes(body, axes))
     times = np.arange(len(seen.world)) / fps if seen.times is None else seen.times
-    found += [*_sides(body), *_frozen(seen), *_limbs(body), *_teleport(body, times), *_path(body)]
-    return found
-
-
-def _units(seen: Seen, axes: Axes, looks: Axes) -> Iterator[Finding]:
-    leg_m = leg_length(seen.world, seen.skeleton)
-    looks_m = leg_m * UNITS_PER_METRE[axes.units] / UNITS_PER_METRE[looks.units]
-    if not LEGS_M[0] <= looks_m <= LEGS_M[1]:
-        yield Finding(
-            about="units",
-            sentence=f"A leg is {leg_m:.3g} m long, which no unit makes that of a person.",
-        )
-    elif looks.units != axes.units:
-        yield Finding(
-            about="units",
-            sentence=f"A leg is {leg_m:.3g} m long where units are {axes.units!r}; they look like "
-            f"{looks.units!r}.",
-        )
-
-
-def _up(axes: Axes, looks: Axes) -> Iterator[Finding]:
-    if looks.up != axes.up:
-        yield Finding(
-            about="up",
-            sentence=f"The shoulders are over the feet along {looks.up!r}, not along "
-            f"{axes.up!r}: the person lies, or up is {looks.up!r}.",
-        )
+    return [*found, *_limbs(upright), *_teleport(upright, times), *_path(upright)]
 
 
 def _joints(seen: Seen) -> Iterator[Finding]:
@@ -106,33 +57,6 @@ def _joints(seen: Seen) -> Iterator[Finding]:
                 sentence=f"{len(names)} of {len(given)} joints are hardly seen and {how}: "
                 f"{', '.join(names)}.",
             )
-
-
-def _sides(body: _Body) -> Iterator[Finding]:
-    """Toes point to where the body faces if left is left; without toes, knees bend to there."""
-    legs = body["left_upper_leg"] - body["right_upper_leg"]
-    arms = body["left_upper_arm"] - body["right_upper_arm"]
-    if np.median((legs[:, :2] * arms[:, :2]).sum(axis=-1)) < 0.0:
-        yield Finding(
-            about="sides",
-            sentence="The left leg is on the side of the right arm: the sides of the legs or of "
-            "the arms are swapped.",
-        )
-        return
-    forward = np.stack([legs[:, 1], -legs[:, 0]], axis=-1)
-    forward /= np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-9)
-    ahead = []
-    for side in ("left", "right"):
-        hip, knee, ankle = (body[f"{side}_{p}"] for p in ("upper_leg", "lower_leg", "foot"))
-        toes = body.get(f"{side}_toes")
-        pointing = knee - (hip + ankle) / 2.0 if toes is None else toes - ankle
-        ahead.append((pointing[:, :2] * forward).sum(axis=-1))
-    if np.median(ahead) < -0.01:
-        what = "toes point" if "left_toes" in body else "knees bend"
-        yield Finding(
-            about="sides",
-            sentence=f"The {what} backwards: left and right look swapped, or the picture mirrored.",
-        )
 
 
 def _frozen(seen: Seen) -> Iterator[Finding]:
@@ -149,7 +73,7 @@ def _frozen(seen: Seen) -> Iterator[Finding]:
         )
 
 
-def _limbs(body: _Body) -> Iterator[Finding]:
+def _limbs(body: Body) -> Iterator[Finding]:
     noise = {}
     for upper, lower in LIMBS:
         if lower in body:
@@ -165,7 +89,7 @@ def _limbs(body: _Body) -> Iterator[Finding]:
         )
 
 
-def _teleport(body: _Body, times: Float[np.ndarray, "T"]) -> Iterator[Finding]:
+def _teleport(body: Body, times: Float[np.ndarray, "T"]) -> Iterator[Finding]:
     steps = np.linalg.norm(np.diff(_pelvis(body), axis=0), axis=-1)
     speeds = steps / np.diff(times)
     if len(speeds) and speeds.max() > MAX_SPEED_M_S:
@@ -177,7 +101,7 @@ def _teleport(body: _Body, times: Float[np.ndarray, "T"]) -> Iterator[Finding]:
         )
 
 
-def _path(body: _Body) -> Iterator[Finding]:
+def _path(body: Body) -> Iterator[Finding]:
     moved = np.max(np.ptp(_pelvis(body), axis=0))
     stepped = np.max(np.ptp(body["left_foot"], axis=0))
     if moved < 1e-3 and stepped > 0.1:
@@ -188,5 +112,5 @@ def _path(body: _Body) -> Iterator[Finding]:
         )
 
 
-def _pelvis(body: _Body) -> Float[np.ndarray, "T 3"]:
+def _pelvis(body: Body) -> Float[np.ndarray, "T 3"]:
     return np.asarray((body["left_upper_leg"] + body["right_upper_leg"]) / 2.0)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Shaped
 from pydantic import ValidationError
 
 from models.bundle import BundleError
+from models.motion.bones import with_fixed_bones
 from models.motion.formats.errors import FormatError
 from models.motion.formats.files import SUFFIXES, WRITTEN_SUFFIXES, read_motion, write_motion
 from models.motion.gaps import without_gaps
@@ -26,7 +27,14 @@ from service.catalog import Catalog
 from service.client import AsyncClient
 from service.errors import FieldError, ServiceError
 from service.exchange import ClientError
-from service.messages import ActionsOptions, ActionsPrediction, Prediction, PredictOptions, Preview
+from service.messages import (
+    ActionsOptions,
+    ActionsPrediction,
+    ActionsPreview,
+    Prediction,
+    PredictOptions,
+    Preview,
+)
 from service.replay import recorded, replayed, told
 from service.schemas import MAX_SEED, MAX_STOP_THRESHOLD_M, MAX_STREAM_HZ
 from service.settings import Settings
@@ -136,12 +144,10 @@ def predict(
             num_modes=num_modes,
             stop_threshold=stop_threshold,
             max_seconds_per_action=max_seconds_per_action,
-            stream=stream or None,
             num_samples=num_samples,
             model=model,
             seed=seed,
         )
-        options.pop("stream", None)
         options |= {"fps": motion.fps, "skeleton": _skeleton(motion)}
         answer = asyncio.run(_answered(seen, labels, options, url=url, stream=stream))
         out.mkdir(parents=True, exist_ok=True)
@@ -166,6 +172,12 @@ def convert(
         str | None, typer.Option(help="a standard skeleton to put it on; its own by default")
     ] = None,
     fps: Annotated[float | None, typer.Option(min=1, max=1000, help="frames per second")] = None,
+    fix_bones: Annotated[
+        bool,
+        typer.Option(
+            "--fix-bones", help="give each bone the median of its lengths, as for a webcam"
+        ),
+    ] = False,
 ) -> None:
     """Write the motion in a file as a file of another kind."""
     with _one_line_errors():
@@ -174,6 +186,8 @@ def convert(
             motion = without_gaps(motion).to(standard_skeleton(skeleton))
         if fps is not None:
             motion = without_gaps(motion).resample(fps)
+        if fix_bones:
+            motion = with_fixed_bones(without_gaps(motion))
         write_motion(out, motion)
         typer.echo(
             f"{motion.num_frames} frames of {motion.skeleton.num_joints} joints at "
@@ -236,11 +250,7 @@ def _options(*, performs: bool, **asked: Any) -> dict[str, Any]:
     options = {name: value for name, value in asked.items() if value is not None}
     if "num_modes" in options:
         options["returned"] = ["futures", "modes"]
-    known = (
-        ActionsOptions.__annotations__
-        if performs
-        else PredictOptions.__annotations__ | {"stream": bool}
-    )
+    known = (ActionsOptions if performs else PredictOptions).__annotations__
     for name in sorted(options.keys() - known):
         raise FieldError(
             pointer=f"/{name}",
@@ -270,11 +280,13 @@ async def _answered(
     stream: bool,
 ) -> Prediction | ActionsPrediction:
     async with _client(url) as client:
-        if labels is not None:
-            return await client.predict_actions(seen.positions, labels, **options)
-        if not stream:
+        if labels is None and not stream:
             return await client.predict(seen.positions, **options)
-        return await _streamed(client.stream(seen.positions, **options), seen.positions[-1:])
+        if labels is None:
+            return await _streamed(client.stream(seen.positions, **options), seen.positions[-1:])
+        if not stream:
+            return await client.predict_actions(seen.positions, labels, **options)
+        return await _performed_so_far(client.stream_actions(seen.positions, labels, **options))
 
 
 async def _streamed(
@@ -288,6 +300,22 @@ async def _streamed(
             moved = np.linalg.norm(event.futures - before, axis=-1).max()
             typer.echo(f"step {event.run} of {event.of}: {moved:.3f} m moved", err=True)
         before = event.futures
+    return prediction
+
+
+async def _performed_so_far(
+    events: AsyncIterator[ActionsPreview | ActionsPrediction],
+) -> ActionsPrediction:
+    """The prediction, after a line on stderr for each chunk of frames before the last."""
+    async for event in events:
+        if isinstance(event, ActionsPrediction):
+            prediction = event
+        else:
+            frames = [len(future) for future in event.futures]
+            typer.echo(
+                f"step {event.run} of {event.of} at most: {min(frames)} to {max(frames)} frames",
+                err=True,
+            )
     return prediction
 
 

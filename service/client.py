@@ -18,6 +18,7 @@ from service.live_client import AsyncLive, Live
 from service.messages import (
     ActionsOptions,
     ActionsPrediction,
+    ActionsPreview,
     Prediction,
     PredictOptions,
     Preview,
@@ -94,7 +95,21 @@ class AsyncClient:
             CutStreamError: the stream broke off; what came before is not the prediction.
             ClientError: one of its subclasses says why there is no prediction.
         """
-        return self._exchange.events(messages.predict(poses, options))
+        return self._exchange.events(messages.predict(poses, options), messages.preview)
+
+    def stream_actions(
+        self,
+        poses: Float[np.ndarray, "T J 3"],
+        actions: Sequence[str],
+        **options: Unpack[ActionsOptions],
+    ) -> AsyncGenerator[ActionsPreview | ActionsPrediction, None]:
+        """Previews as the frames are made, and then what ``predict_actions`` gives.
+
+        Raises:
+            ClientError: as ``stream``.
+        """
+        call = messages.predict_actions(poses, actions, options)
+        return self._exchange.events(call, messages.actions_preview)
 
     def live(self, *, rate_hz: float = 10.0, **options: Unpack[PredictOptions]) -> AsyncLive:
         """Futures of poses as they come; an async context manager, which is iterated."""
@@ -163,7 +178,17 @@ class Client:
         self, poses: Float[np.ndarray, "T J 3"], **options: Unpack[PredictOptions]
     ) -> Iterator[Preview | Prediction]:
         """`AsyncClient.stream`."""
-        return each_now(self._exchange.events(messages.predict(poses, options)))
+        return each_now(self._exchange.events(messages.predict(poses, options), messages.preview))
+
+    def stream_actions(
+        self,
+        poses: Float[np.ndarray, "T J 3"],
+        actions: Sequence[str],
+        **options: Unpack[ActionsOptions],
+    ) -> Iterator[ActionsPreview | ActionsPrediction]:
+        """`AsyncClient.stream_actions`."""
+        call = messages.predict_actions(poses, actions, options)
+        return each_now(self._exchange.events(call, messages.actions_preview))
 
     def live(self, *, rate_hz: float = 10.0, **options: Unpack[PredictOptions]) -> Live:
         """Futures of poses as they come; a context manager, which is iterated."""

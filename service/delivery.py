@@ -1,6 +1,6 @@
 """Bytes on their way to a client, who may leave at any time: whole answers, and streams of events.
 
-A stream is ``accepted``, a ``preview`` after each step, ``final`` and ``end``. Where it breaks off
+A stream is ``accepted``, ``preview`` after ``preview``, ``final`` and ``end``. Where it breaks off
 there is an ``error`` in the place of the rest; without ``end`` it is not complete.
 """
 

@@ -10,7 +10,7 @@ ClientError                 the service did not answer with a prediction
 """
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator
 from itertools import count
 from math import inf
 from secrets import SystemRandom
@@ -21,13 +21,13 @@ from urllib.parse import quote
 import httpx
 import orjson
 
-from service import messages
 from service.media import MSGPACK, NDJSON, decoded, encoded
-from service.messages import Call, Preview
+from service.messages import Call
 
 BACK_OFF_S = 0.1  # at most, before the second try; doubled for each that follows
 
 _T = TypeVar("_T")
+_PreviewT = TypeVar("_PreviewT")
 
 
 class ClientError(Exception):
@@ -151,7 +151,9 @@ class Exchange:
         media_type = response.headers["content-type"].partition(";")[0]
         return call.read(decoded(response.content, media_type, limit=len(response.content)))
 
-    async def events(self, call: Call[_T]) -> AsyncGenerator[Preview | _T, None]:
+    async def events(
+        self, call: Call[_T], preview: Callable[[dict[str, Any]], _PreviewT]
+    ) -> AsyncGenerator[_PreviewT | _T, None]:
         """Previews, and then what the call gives; once it has begun, it is not sent again."""
         response = await self._sent(call, accept=NDJSON, stream=True)
         told: dict[str, Any] = {}
@@ -161,7 +163,7 @@ class Exchange:
                 name, content = event["event"], event.get("data")
                 told[name] = content
                 if name == "preview":
-                    yield messages.preview(content)
+                    yield preview(content)
                 elif name == "error":
                     raise problem_error(content["status"], content)
                 elif name == "end":

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from fastapi import APIRouter, WebSocket
+from jaxtyping import Shaped
 from pydantic import BaseModel, ValidationError
 from starlette.types import Message
 from starlette.websockets import WebSocketDisconnect
@@ -32,11 +33,11 @@ from service.errors import (
 from service.guard import STREAM_PROTOCOL
 from service.media import JSON, MSGPACK, decoded, encoded
 from service.observation import frames_needed
-from service.poses import poses_array, shown
-from service.predictions import Plan, deadline_of, planned, prepared, seed_of
+from service.plans import Plan, deadline_of, planned, prepared, seed_of
+from service.poses import confidence_array, poses_array, shown
 from service.problems import content_of, field_error, problem
 from service.schemas import PredictRequest, StreamFrame, StreamStart
-from service.sessions import Session, Watch
+from service.sessions import Frame, Session, Watch
 from service.skeletons import requested_skeleton, sent_joints
 
 MAX_MESSAGE_BYTES = 2**16
@@ -46,7 +47,7 @@ CLOSING_S = 1.0
 router = APIRouter()
 
 _BodyT = TypeVar("_BodyT", bound=BaseModel)
-_TOLD_BY_FRAMES = ("poses", "timestamps")
+_TOLD_BY_FRAMES = ("poses", "timestamps", "confidence")
 
 
 @router.websocket("/v1/stream")
@@ -153,7 +154,7 @@ class _Connection:
             num_frames=frames_needed(manifest, body.fps or manifest.fps),
         )
         self._session = session = self._opened(start.session, watch)
-        self._body = body.model_copy(update={"seed": seed_of(body)})
+        self._body = body.model_copy(update={"seed": seed_of(body), "fps": watch.fps})
         self._period_s = 1.0 / start.rate_hz
         self._facts["model"] = manifest.name
         self._unsent["ready"] = {
@@ -180,12 +181,17 @@ class _Connection:
         if self._session is None:
             raise FieldError(pointer="/type", found='"frame"', expected='"start" comes first')
         frame = _checked(StreamFrame, content)
-        pose = frame.pose[None] if isinstance(frame.pose, np.ndarray) else [frame.pose]
+        num_joints, worth = len(self._session.watch.joints), None
         try:
-            (seen,) = poses_array(pose, num_joints=len(self._session.watch.joints))
+            (pose,) = poses_array(_alone(frame.pose), num_joints=num_joints)
+            if frame.confidence is not None:
+                (worth,) = confidence_array(
+                    _alone(frame.confidence), num_frames=1, num_joints=num_joints
+                )
         except FieldError as error:
-            raise _at(error, re.sub("^/poses(/0)?", "/pose", error.pointer or "")) from error
-        self._session.history.add(frame.t, seen)
+            pointer = re.sub("^/poses(/0)?", "/pose", error.pointer or "")
+            raise _at(error, re.sub("^/confidence/0", "/confidence", pointer)) from error
+        self._session.history.add(Frame(t=frame.t, pose=pose, confidence=worth))
         self._facts["frames"] += 1
 
     async def _speak(self) -> None:
@@ -229,7 +235,7 @@ class _Connection:
         return 0.0
 
     async def _predicted(self, session: Session) -> bytes:
-        body = self._body.model_copy(update={"poses": session.history.poses()})
+        body = self._body.model_copy(update=session.history.observed())
         arrived_s = perf_counter()
         session.num_answers += 1
         async with self._socket.state.admitted():
@@ -292,6 +298,11 @@ def _checked(model: type[_BodyT], content: dict[str, Any], *, within: str = "") 
     except ValidationError as error:
         wrong = field_error(error.errors(), content)
         raise _at(wrong, f"{within}{wrong.pointer}") from error
+
+
+def _alone(values: list[Any] | Shaped[np.ndarray, "..."]) -> list[Any] | Shaped[np.ndarray, "..."]:
+    """What one frame tells, as that of all frames of a request."""
+    return values[None] if isinstance(values, np.ndarray) else [values]
 
 
 def _at(error: FieldError, pointer: str) -> FieldError:

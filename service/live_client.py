@@ -9,6 +9,7 @@ import asyncio
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from functools import partial
 from secrets import SystemRandom
 from time import monotonic
 from types import TracebackType
@@ -75,10 +76,22 @@ class AsyncLive:
         self._running.cancel()
         await asyncio.gather(self._running, return_exceptions=True)
 
-    def push(self, pose: Float[np.ndarray, "J 3"], t: float | None = None) -> None:
-        """Tell of a pose, and the second when it was seen; now by default. NaN was not seen."""
+    def push(
+        self,
+        pose: Float[np.ndarray, "J 3"],
+        t: float | None = None,
+        *,
+        confidence: Float[np.ndarray, "J"] | None = None,
+    ) -> None:
+        """Tell of a pose, and the second when it was seen; now by default.
+
+        A joint of NaN was not seen; ``confidence`` is what each joint is worth, from 0 to 1.
+        """
         seen_s = monotonic() if t is None else float(t)
-        self._frames.append({"type": "frame", "t": seen_s, "pose": np.asarray(pose)})
+        frame = {"type": "frame", "t": seen_s, "pose": np.asarray(pose)}
+        if confidence is not None:
+            frame["confidence"] = np.asarray(confidence)
+        self._frames.append(frame)
         self._pushed.set()
 
     def latest(self) -> LivePrediction | None:
@@ -230,9 +243,15 @@ class Live:
     ) -> None:
         self._stack.close()
 
-    def push(self, pose: Float[np.ndarray, "J 3"], t: float | None = None) -> None:
+    def push(
+        self,
+        pose: Float[np.ndarray, "J 3"],
+        t: float | None = None,
+        *,
+        confidence: Float[np.ndarray, "J"] | None = None,
+    ) -> None:
         """`AsyncLive.push`."""
-        self._portal.call(self._live.push, pose, t)
+        self._portal.call(partial(self._live.push, pose, t, confidence=confidence))
 
     def latest(self) -> LivePrediction | None:
         """`AsyncLive.latest`."""

@@ -75,6 +75,29 @@ class Preview:
     of: int
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ActionSegment:
+    """The frames ``start`` to before ``end`` of a future, in which one action is performed.
+
+    ``stopped`` is false where the action was cut off, or in a preview has not ended yet.
+    """
+
+    action: str
+    start: int
+    end: int
+    stopped: bool
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class ActionsPreview:
+    """The futures of actions as far as they are after ``run`` chunks of frames, ``of`` at most."""
+
+    futures: tuple[Float[np.ndarray, "_ J 3"], ...]
+    segments: tuple[tuple[ActionSegment, ...], ...]
+    run: int
+    of: int
+
+
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Answer:
     """What every answer says beside its futures; ``timing_ms`` of each stage is the server's.
@@ -114,19 +137,6 @@ class LivePrediction:
 
     t: float
     prediction: Prediction
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ActionSegment:
-    """The frames ``start`` to before ``end`` of a future, in which one action is performed.
-
-    ``stopped`` is false where the action was cut off.
-    """
-
-    action: str
-    start: int
-    end: int
-    stopped: bool
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -244,14 +254,16 @@ def _occupancy(
 
 
 def _actions_prediction(content: dict[str, Any]) -> ActionsPrediction:
-    futures = content.get("futures", ())
-    return ActionsPrediction(
-        futures=tuple(np.array(future["poses"]) for future in futures),
-        segments=tuple(
+    return ActionsPrediction(**_performed(content.get("futures", ())), **_said(content))
+
+
+def _performed(futures: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "futures": tuple(np.array(future["poses"]) for future in futures),
+        "segments": tuple(
             tuple(ActionSegment(**segment) for segment in future["segments"]) for future in futures
         ),
-        **_said(content),
-    )
+    }
 
 
 def _said(content: dict[str, Any]) -> dict[str, Any]:
@@ -271,3 +283,8 @@ def _said(content: dict[str, Any]) -> dict[str, Any]:
 def preview(content: dict[str, Any]) -> Preview:
     """What a stream says after a step."""
     return Preview(futures=np.array(content["futures"]), **content["steps"])
+
+
+def actions_preview(content: dict[str, Any]) -> ActionsPreview:
+    """What a stream of actions says after a chunk of frames."""
+    return ActionsPreview(**_performed(content["futures"]), **content["steps"])

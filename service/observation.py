@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from math import ceil, floor
+from math import ceil
 from typing import Any, Literal
 
 import numpy as np
@@ -11,21 +10,31 @@ from jaxtyping import Bool, Float, Shaped
 
 from models.bundle import Manifest
 from models.motion.axes import Axes
-from models.motion.gaps import MIN_CONFIDENCE, at_even_times, even_rate, filled, steadied, trusted
+from models.motion.bones import bone_parents
+from models.motion.gaps import (
+    MIN_CONFIDENCE,
+    at_even_times,
+    even_rate,
+    filled,
+    num_even,
+    steadied,
+    trusted,
+)
+from models.motion.guesses import body_of
 from models.motion.kinematics import bone_lengths
 from models.motion.motion import Motion
-from models.motion.skeleton import BODY21, Skeleton, SkeletonError, joint_map, resolve_joints
+from models.motion.skeleton import Skeleton, SkeletonError, joint_map
 from models.motion.trees import without_joints
 from service.errors import PosesError, TooFewFramesError, UnknownSkeletonError
 from service.person import check_person
 from service.poses import confidence_array, poses_array, times_array
 from service.skeletons import OwnJoints, own_skeleton, sent_order
+from service.stance import Finding, stance
 
 Source = Literal["observed", "derived", "imputed"]
 
 MIN_FPS, MAX_FPS = 5.0, 300.0
 LONG_GAP_S = 0.25
-MAX_BONES = 3  # of body21, that move as one
 MAX_HEIGHT_M = 10.0  # of the lowest joint over z = 0; above, it is brought down to the ground
 
 
@@ -160,6 +169,8 @@ def observe(seen: Seen, *, axes: Axes, fps: float, manifest: Manifest) -> Observ
     window = window[-num_frames - 1 :]
     is_seen = np.isfinite(window[0, :, 0])
     weights, guessed = body_weights(skeleton, is_seen, target)
+    body = body_of(window[:, is_seen], without_joints(skeleton, is_seen))
+    odd = [_warning(finding) for finding in stance(body, axes)]
     root = np.matmul(weights[0], window[-1, is_seen])
     lowest = float(window[-1, is_seen, 2].min())
     offset = np.array([root[0], root[1], lowest if abs(lowest) > MAX_HEIGHT_M else 0.0])
@@ -176,12 +187,18 @@ def observe(seen: Seen, *, axes: Axes, fps: float, manifest: Manifest) -> Observ
         offset=offset,
         last_pose=near[-1],
         bones=np.median(bone_lengths(near[-num_frames:], skeleton.parents), axis=0),
-        bone_parents=_bone_parents(skeleton, fixed),
+        bone_parents=bone_parents(skeleton, loose=np.flatnonzero(fixed).tolist()),
         fixed=fixed,
         sources=sources(recent),
     )
     positions = _at_rate(mapped, fps, manifest).astype(np.float32)
-    return Observation(positions=positions, caller=caller, warnings=(*warnings, *guessed))
+    return Observation(positions=positions, caller=caller, warnings=(*warnings, *guessed, *odd))
+
+
+def _warning(finding: Finding) -> str:
+    """A finding about how the body stands, as an answer says it."""
+    where = "poses" if finding.about == "sides" else f"axes.{finding.about}"
+    return f"{where}: {finding.sentence[0].lower()}{finding.sentence[1:]}"
 
 
 def sources(seen: Seen) -> tuple[Source, ...]:
@@ -213,7 +230,7 @@ def frames_needed(manifest: Manifest, fps: float) -> int:
 def _check_length(seen: Seen, fps: float, manifest: Manifest) -> None:
     found, needed = len(seen.world), frames_needed(manifest, fps)
     if seen.times is not None and found > 1:
-        found = floor((seen.times[-1] - seen.times[0]) * fps + 0.5) + 1
+        found = num_even(float(seen.times[-1] - seen.times[0]), fps)
     if found < needed:
         seconds = manifest.num_observed / manifest.fps
         raise TooFewFramesError(
@@ -258,15 +275,15 @@ def _whole(recent: Seen, fps: float) -> tuple[Float[np.ndarray, "T J 3"], list[s
     ]
     times = np.arange(frames) / fps if recent.times is None else recent.times
     world = filled(world, times, parents)
-    if recent.confidence is not None:
-        world = steadied(world, np.where(seen, recent.confidence, 0.0), fps)
+    worth = None if recent.confidence is None else np.where(seen, recent.confidence, 0.0)
     if recent.times is not None:
         if (longest := float(np.diff(times).max())) > LONG_GAP_S:
             warnings.append(
                 f"timestamps: {longest:.2f} s lie between two frames; filled with a straight line."
             )
         world = at_even_times(world, times, fps)
-    return world, warnings
+        worth = None if worth is None else at_even_times(worth, times, fps)
+    return world if worth is None else steadied(world, worth, fps), warnings
 
 
 def body_weights(
@@ -312,39 +329,6 @@ def _fixed(near: Float[np.ndarray, "T J 3"], used: Sequence[int]) -> Bool[np.nda
     fixed = (moved < 1e-3) & (moved[list(used)].min() > 1e-2)
     fixed[list(used)] = False
     return np.asarray(fixed)
-
-
-def _bone_parents(skeleton: Skeleton, fixed: Bool[np.ndarray, "J"]) -> tuple[int, ...]:
-    """Parents, or -1 where no bone joins them to their child: above the hips, fixed, far off."""
-    loose = {int(joint) for joint in np.flatnonzero(fixed)}
-    hips = resolve_joints(skeleton).get("hips", skeleton.joints[0])
-    over = skeleton.parents[skeleton.index(hips)]
-    while over >= 0:
-        loose.add(over)
-        over = skeleton.parents[over]
-    return tuple(
-        parent if near and not {joint, parent} & loose else -1
-        for joint, (parent, near) in enumerate(zip(skeleton.parents, _near(skeleton), strict=True))
-    )
-
-
-@lru_cache(maxsize=256)
-def _near(skeleton: Skeleton) -> tuple[bool, ...]:
-    """Whether each joint is so near to its parent in the body that a bone may join them.
-
-    From a shoulder to a hip, as where there is no trunk, is no bone.
-    """
-    nearest = joint_map(BODY21, skeleton)[0].argmax(axis=1)
-    lines = []
-    for joint in map(int, nearest):
-        line = {joint}
-        while (joint := BODY21.parents[joint]) >= 0:
-            line.add(joint)
-        lines.append(line)
-    return tuple(
-        len(lines[joint] ^ lines[parent]) <= MAX_BONES
-        for joint, parent in enumerate(skeleton.parents)
-    )
 
 
 def _at_rate(

@@ -1,6 +1,8 @@
 """Whether, when and how near a person comes to regions of the world, told from the samples.
 
 A person is the lines of their bones; ``margin_m`` stands for flesh, and for the caution one wants.
+Probabilities are shares of the samples. The calibration of a bundle is of balls about single joints
+and has a factor for each level, so none of its factors is that of a whole body entering a region.
 """
 
 from abc import ABC, abstractmethod

@@ -66,10 +66,14 @@ def confidence_array(
     Raises:
         FieldError: there is not one number from 0 to 1 for each joint of each frame.
     """
-    expected = f"there must be {num_joints} numbers from 0 to 1 for each of {num_frames} frames"
     rows = confidence.tolist() if isinstance(confidence, np.ndarray) else list(confidence)
     if len(rows) != num_frames:
-        raise FieldError(pointer="/confidence", found=f"{len(rows)} frames", expected=expected)
+        raise FieldError(
+            pointer="/confidence",
+            found=f"{len(rows)} frames",
+            expected=f"there must be one for each of {num_frames} frames",
+        )
+    expected = f"each frame has {num_joints} numbers from 0 to 1, one for each joint"
     for i, row in enumerate(rows):
         if not isinstance(row, list) or len(row) != num_joints:
             raise FieldError(pointer=f"/confidence/{i}", found=shown(row), expected=expected)

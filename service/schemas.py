@@ -19,7 +19,6 @@ from pydantic_core import PydanticCustomError
 from models.motion.axes import UNITS_PER_METRE, Axes, Handed, Units, Up
 from models.motion.gaps import MIN_CONFIDENCE
 from models.motion.standards import STANDARDS
-from service.checks import About
 from service.engine.trajectory import StoppedBy
 from service.example import ACTIONS_EXAMPLE, EXAMPLE
 from service.futures import BoneLengths
@@ -27,6 +26,7 @@ from service.observation import MAX_FPS, MIN_FPS, Source
 from service.occupancy import LEVELS, MAX_MARGIN_M, MAX_REGIONS, Box, Capsule, Query, Region
 from service.quantiles import DEFAULT_LEVELS
 from service.skeletons import OwnJoints
+from service.stance import About
 
 MAX_SEED = 2**53 - 1  # the largest integer that every JSON reader keeps
 MAX_ACTIONS = 16
@@ -452,7 +452,11 @@ class Distance(_Body):
 
 
 class Occupancy(_Body):
-    """What the futures say of one region; shares of samples, which no measurement has widened."""
+    """What the futures say of one region: shares of the samples, not measured probabilities.
+
+    Samples are surer than people are, and no calibration widens them here: a region that none of
+    them enters may be entered. Measured regions are those of `quantiles`, where `calibrated`.
+    """
 
     probability: list[Any] = Field(description="[frames]: of those that last so long, in it then")
     num_lasting: list[int] = Field(description="[frames]: how many futures last so long")
@@ -502,6 +506,9 @@ class StreamFrame(_Body):
     type: Literal["frame"]
     t: float = Field(allow_inf_nan=False, description="seconds on any clock, later each time")
     pose: list[Any] | InstanceOf[np.ndarray]
+    confidence: list[Any] | InstanceOf[np.ndarray] | None = Field(
+        default=None, description="[joints], as POST /predict has it for each frame"
+    )
 
 
 class ActionSegment(_Body):

@@ -4,47 +4,49 @@ from asyncio import Event
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from time import monotonic
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
 from jaxtyping import Float
 
 from models.motion.axes import Axes
+from models.motion.gaps import num_even
 from service.errors import FieldError
 
 GAP_S = 0.5  # without a frame, after which what was seen before tells nothing of now
 KEPT_S = 30.0  # after the connection was lost
 FRAMES_PER_PERIOD = 5  # kept at most; more say nothing new
-NEAR_S = 1e-6  # of a moment: a frame is taken as it is
 
-Frame = tuple[float, Float[np.ndarray, "J 3"]]
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Frame:
+    """A pose, when it was seen, and what each of its joints is worth, if that was told."""
+
+    t: float
+    pose: Float[np.ndarray, "J 3"]
+    confidence: Float[np.ndarray, "J"] | None = None
 
 
 class History:
-    """The latest frames of a person at their own times, of which the older are forgotten."""
+    """The latest frames of a person as they came, of which the older are forgotten."""
 
     def __init__(self, *, fps: float, num_frames: int, frames: Iterable[Frame] = ()) -> None:
         self._fps = fps
         self._num_frames = num_frames
-        self._times: list[float] = []
-        self._poses: list[Float[np.ndarray, "J 3"]] = []
-        for t, pose in frames:
-            self.add(t, pose)
-
-    @property
-    def frames(self) -> list[Frame]:
-        """The frames, the latest last."""
-        return list(zip(self._times, self._poses, strict=True))
+        self.frames: list[Frame] = []
+        for frame in frames:
+            self.add(frame)
 
     @property
     def newest_s(self) -> float | None:
         """The time of the latest frame."""
-        return self._times[-1] if self._times else None
+        return self.frames[-1].t if self.frames else None
 
     @property
     def have_s(self) -> float:
         """Seconds from the first frame to the latest."""
-        return self._times[-1] - self._times[0] if self._times else 0.0
+        return self.frames[-1].t - self.frames[0].t if self.frames else 0.0
 
     @property
     def need_s(self) -> float:
@@ -54,57 +56,40 @@ class History:
     @property
     def suffices(self) -> bool:
         """Whether so much has been seen."""
-        return self._num_moments >= self._num_frames
+        return num_even(self.have_s, self._fps) >= self._num_frames
 
-    @property
-    def _num_moments(self) -> int:
-        """How many moments, a period between them, lie within what has been seen."""
-        if not self._times:
-            return 0
-        return min(self._num_frames, int((self.have_s + NEAR_S) * self._fps)) + 1
-
-    def add(self, t: float, pose: Float[np.ndarray, "J 3"]) -> None:
+    def add(self, frame: Frame) -> None:
         """Take a frame; one that is far from the last in time begins a new history.
 
         Raises:
             FieldError: it is not later than the last one.
         """
-        last = self.newest_s
+        t, last = frame.t, self.newest_s
         if last is not None and abs(t - last) > GAP_S:
-            self._times.clear()
-            self._poses.clear()
+            self.frames.clear()
         elif last is not None and t <= last:
             raise FieldError(
                 pointer="/t", found=f"{t:g} s", expected=f"must be after the last, at {last:g} s"
             )
-        if len(self._times) > 1 and t - self._times[-2] < 1.0 / (FRAMES_PER_PERIOD * self._fps):
-            self._times.pop()
-            self._poses.pop()
-        self._times.append(t)
-        self._poses.append(pose)
+        if len(self.frames) > 1 and t - self.frames[-2].t < 1.0 / (FRAMES_PER_PERIOD * self._fps):
+            self.frames.pop()
+        self.frames.append(frame)
         # One frame is kept from before all that is looked at, as one more than needed helps.
         oldest = t - (self._num_frames + 1) / self._fps
-        while len(self._times) > 1 and self._times[1] <= oldest:
-            del self._times[0], self._poses[0]
+        while len(self.frames) > 1 and self.frames[1].t <= oldest:
+            del self.frames[0]
 
-    def poses(self) -> Float[np.ndarray, "T J 3"]:
-        """Evenly at the rate until the latest frame, one more than needed where it is there.
-
-        Between two frames on the line between them; a joint that is NaN in either is NaN.
-        """
-        times, poses = np.array(self._times), np.stack(self._poses)
-        if len(times) == 1:
-            return poses
-        moments = times[-1] - np.arange(self._num_moments - 1, -1, -1) / self._fps
-        after = np.clip(np.searchsorted(times, moments - NEAR_S), 1, len(times) - 1)
-        share = ((moments - times[after - 1]) / np.diff(times)[after - 1])[:, None, None]
-        between: Float[np.ndarray, "T J 3"] = poses[after - 1] + share * (
-            poses[after] - poses[after - 1]
-        )
-        for exact in (after - 1, after):
-            near = np.abs(times[exact] - moments) <= NEAR_S
-            between[near] = poses[exact[near]]
-        return between
+    def observed(self) -> dict[str, Any]:
+        """The frames as the fields of a request; one that told no confidence is sure."""
+        told = [frame.confidence for frame in self.frames]
+        sure = np.ones(len(self.frames[-1].pose))
+        return {
+            "poses": np.stack([frame.pose for frame in self.frames]),
+            "timestamps": [frame.t for frame in self.frames],
+            "confidence": None
+            if all(worth is None for worth in told)
+            else np.stack([sure if worth is None else worth for worth in told]),
+        }
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

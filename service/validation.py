@@ -7,10 +7,11 @@ from fastapi import APIRouter
 
 from models.bundle import Manifest
 from models.motion.axes import Axes
+from models.motion.guesses import body_of
 from models.motion.skeleton import BODY21, Skeleton, joint_map
 from service import schemas
 from service.body import BodyRoute
-from service.checks import findings, guessed_axes, whole
+from service.checks import findings, whole
 from service.dependencies import TheCatalog
 from service.errors import (
     BodyTooLargeError,
@@ -26,6 +27,7 @@ from service.errors import (
 from service.observation import Seen, body_weights, caller_rate, observe, read_seen, sources
 from service.problems import content_of, declared
 from service.skeletons import requested_skeleton
+from service.stance import guessed_axes
 
 router = APIRouter(route_class=BodyRoute, responses=declared(UnauthorisedError))
 
@@ -88,7 +90,8 @@ def _check_body(seen: Seen) -> None:
 def _told(seen: Seen, axes: Axes, fps: float) -> schemas.Validation:
     place = {index: i for i, index in enumerate(seen.order)}
     given = sources(seen)
-    looks = guessed_axes(whole(seen), axes)
+    filled_in = whole(seen)
+    looks = guessed_axes(body_of(filled_in.world, filled_in.skeleton), axes)
     mapped, estimated, guessed = _resolved(seen.skeleton)
     return schemas.Validation(
         predicts=True,

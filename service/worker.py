@@ -173,6 +173,10 @@ class Worker:
             ids = [i for i, job in self._jobs.items() if job.key == request_key]
         return any([self._cancel(request_id) for request_id in ids])
 
+    def steps_of(self, request: Request) -> int:
+        """The steps of a request, were it to run them all."""
+        return self._engine.steps_of(request)
+
     def load(self) -> Load:
         """What is under way."""
         return Load(requests=self._engine.num_requests, rows=self._engine.num_rows)

@@ -10,6 +10,7 @@ from models.motion.trees import without_joints
 
 MIN_CONFIDENCE = 0.3  # below, a joint counts as not seen
 STIFFNESS = 0.1  # of `steadied`, at 30 frames per second
+NEAR_S = 1e-6  # of a moment: a frame is taken as it is
 
 
 def filled(
@@ -39,16 +40,24 @@ def filled(
 
 
 def at_even_times(
-    positions: Float[np.ndarray, "T J 3"], times: Float[np.ndarray, "T"], fps: float
-) -> Float[np.ndarray, "N J 3"]:
-    """Positions at an even rate that ends at the last time, on lines between neighbours.
+    values: Float[np.ndarray, "T *rest"], times: Float[np.ndarray, "T"], fps: float
+) -> Float[np.ndarray, "N *rest"]:
+    """Values, such as positions, at an even rate that ends at the last of rising times.
 
-    The first frame may be half a frame before the first time.
+    A frame that is there at such a moment is taken as it is; the others lie on lines between
+    neighbours. The first one may be half a frame before the first time.
     """
-    count = int(np.floor((times[-1] - times[0]) * fps + 0.5)) + 1
+    count = num_even(float(times[-1] - times[0]), fps)
     even = times[-1] - np.arange(count)[::-1] / fps
-    flat = positions.reshape(len(positions), -1)
-    return _interpolated(even, times, flat).reshape(count, *positions.shape[1:])
+    nearest = times[np.searchsorted(times, even - NEAR_S)]
+    even = np.where(np.abs(nearest - even) <= NEAR_S, nearest, even)
+    flat = values.reshape(len(values), -1)
+    return _interpolated(even, times, flat).reshape(count, *values.shape[1:])
+
+
+def num_even(seconds: float, fps: float) -> int:
+    """How many frames `at_even_times` makes of times that span so many seconds."""
+    return int(np.floor(seconds * fps + 0.5)) + 1
 
 
 def even_rate(times: Float[np.ndarray, "T"]) -> float:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -10,11 +11,16 @@ from models.motion.axes import UNITS_PER_METRE, Units, Up
 from models.motion.skeleton import BODY21, Skeleton, joint_map
 
 LEGS_M = (0.4, 1.15)  # hip to ankle, from a child of four to a very tall adult
+UPRIGHT = ("left_upper_arm", "right_upper_arm", "left_foot", "right_foot")
 _UPS: tuple[tuple[Up, Up], ...] = (("x", "-x"), ("y", "-y"), ("z", "-z"))
 
 
-def body_of(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> dict[str, np.ndarray]:
-    """The paths of body21's joints that can be told, (T, 3) each.
+Body: TypeAlias = Mapping[str, np.ndarray]
+"""The paths of joints of body21, (T, 3) each."""
+
+
+def body_of(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> Body:
+    """The paths of body21's joints that can be told.
 
     Raises:
         SkeletonError: A required joint of body21 is missing.
@@ -24,30 +30,20 @@ def body_of(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> dict[s
     for row, joint, is_known in zip(weights, BODY21.joints, known, strict=True):
         used = np.flatnonzero(row)
         if is_known:
-            paths[joint] = np.einsum("j,tjk->tk", row[used], positions[:, used])
+            paths[joint] = row[used] @ positions[:, used]
     return paths
 
 
-def guess_up(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> Up:
-    """The axis along which the upper arms are above the feet, most of the time.
-
-    Raises:
-        SkeletonError: A required joint of body21 is missing.
-    """
-    body = body_of(positions, skeleton)
+def guess_up(body: Body) -> Up:
+    """The axis along which the upper arms are above the feet, most of the time; by `UPRIGHT`."""
     upwards = _middle(body, "upper_arm") - _middle(body, "foot")
     mean = np.median(upwards, axis=0)
     axis = int(np.abs(mean).argmax())
     return _UPS[axis][int(mean[axis] < 0)]
 
 
-def leg_length(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> float:
-    """Hip to knee to ankle in units of the positions, the mean of both legs; median over time.
-
-    Raises:
-        SkeletonError: A required joint of body21 is missing.
-    """
-    body = body_of(positions, skeleton)
+def leg_length(body: Body) -> float:
+    """Hip to knee to ankle in units of the body, the mean of both legs; median over time."""
     lengths = [
         np.linalg.norm(body[f"{side}_{lower}"] - body[f"{side}_{upper}"], axis=-1)
         for side in ("left", "right")
@@ -71,5 +67,5 @@ def plausible_factor(leg: float, factors: Iterable[float]) -> float:
     return next(fitting, nearest)
 
 
-def _middle(body: Mapping[str, np.ndarray], part: str) -> Float[np.ndarray, "T 3"]:
+def _middle(body: Body, part: str) -> Float[np.ndarray, "T 3"]:
     return np.asarray((body[f"left_{part}"] + body[f"right_{part}"]) / 2.0)

@@ -11,7 +11,7 @@ from service.engine.context import Context, unencoded
 from service.engine.costs import Costs
 from service.engine.runner import Runner
 from service.engine.sampling import Stepper, noise, x_first
-from service.engine.trajectory import Request, Samples, StoppedBy
+from service.engine.trajectory import Request, Samples, Shown, StoppedBy
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -53,9 +53,12 @@ class Denoising:
         return self.steps_before + self.steps_run
 
     @property
-    def shown(self) -> Float[np.ndarray, "n H J 3"] | None:
+    def shown(self) -> list[Shown]:
         """The futures as they stand, where the request asks for previews."""
-        return self.future if self.request.previews else None
+        if self.future is None or not self.request.previews:
+            return []
+        indices, steps = self.sample_indices, self.steps_behind
+        return [Shown(sample_indices=indices, futures=self.future, steps_run=steps)]
 
     @property
     def now_and_next(self) -> tuple[int, int | None]:
@@ -102,12 +105,17 @@ class Denoiser:
         self._stepper = Stepper(spec.schedule(), eta=spec.eta) if spec else None
         self._draws = spec is not None and spec.eta > 0.0
 
+    def steps_of(self, request: Request) -> int:
+        """The steps of all its legs."""
+        legs = -(-(request.horizon or self._manifest.horizon) // self._manifest.horizon)
+        return legs * self._manifest.chain_steps(request.num_steps)
+
     def start(self, request_id: int, request: Request) -> list[Denoising]:
         """All samples before their first step; where nothing is drawn, a single one."""
         manifest = self._manifest
         num_samples = request.num_samples if self._schedule else 1
         steps = manifest.timesteps(request.num_steps)
-        whole = len(steps) == manifest.chain_steps(request.num_steps)
+        wanted = min(manifest.default_steps, manifest.chain_steps(request.num_steps))
         horizon = request.horizon or manifest.horizon
         parts = Denoising(
             request_id=request_id,
@@ -116,7 +124,7 @@ class Denoiser:
             context=Context(tensors={"observation": request.observation[None]}),
             timesteps=steps,
             num_legs=-(-horizon // manifest.horizon),
-            stopped_by="end" if whole else "num_steps",
+            stopped_by="end" if len(steps) >= wanted else "num_steps",
             past=np.empty((num_samples, 0, len(manifest.skeleton.joints), 3), np.float32),
         )
         return [parts]

@@ -13,7 +13,7 @@ from service.engine.admission import check
 from service.engine.context import unencoded
 from service.engine.costs import Costs
 from service.engine.denoising import Denoiser
-from service.engine.job import Job, Shown
+from service.engine.job import Job
 from service.engine.performing import Performer
 from service.engine.runner import Runner
 from service.engine.scheduler import Scheduler
@@ -24,6 +24,7 @@ from service.engine.trajectory import (
     Request,
     Result,
     Samples,
+    Shown,
     Trajectory,
 )
 from service.errors import DeadlineError, EngineError, ServiceError
@@ -162,11 +163,8 @@ class Engine:
         )
 
     def steps_of(self, request: Request) -> int:
-        """The steps of all its legs, were it to run them all."""
-        horizon = self.manifest.horizon
-        return self.manifest.chain_steps(request.num_steps) * math.ceil(
-            (request.horizon or horizon) / horizon
-        )
+        """The steps of a request, were it to run them all."""
+        return self._progress.steps_of(request)
 
     def seconds_until_free(self, *, requests: int, rows: int, shares: int = 1) -> float:
         """When so many requests, with so many rows, will probably have ended."""

@@ -4,19 +4,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
-from service.engine.trajectory import Preview, Request, Result, Samples, StoppedBy, Trajectory
+from service.engine.trajectory import (
+    Preview,
+    Request,
+    Result,
+    Samples,
+    Segment,
+    Shown,
+    StoppedBy,
+    Trajectory,
+)
 
 _BY_WEIGHT: tuple[StoppedBy, ...] = ("deadline", "tolerance", "num_steps", "end")
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Shown:
-    """Futures of some samples as they stand after a step."""
-
-    sample_indices: Shaped[np.ndarray, "n"]
-    futures: Float[np.ndarray, "n H J 3"]
 
 
 @dataclass(kw_only=True, slots=True, eq=False)
@@ -45,22 +46,27 @@ class Job:
         self.num_whole += len(samples.sample_indices)
 
     def show(self, rows: Trajectory) -> None:
-        """Keep what the rows show, for the preview of their step."""
-        if rows.shown is not None:
-            shown = Shown(sample_indices=rows.sample_indices, futures=rows.shown)
-            self.previews.setdefault(rows.steps_behind, []).append(shown)
+        """Keep what the rows show, for the previews of their steps."""
+        for shown in rows.shown:
+            self.previews.setdefault(shown.steps_run, []).append(shown)
 
     def ready(self) -> list[tuple[int, list[Shown]]]:
         """Steps that every row has behind it, or needs no more, and the futures of all then."""
         found: list[tuple[int, list[Shown]]] = []
         for step in sorted(self.previews):
             whole = [
-                Shown(sample_indices=samples.sample_indices, futures=samples.futures)
+                Shown(
+                    sample_indices=samples.sample_indices,
+                    futures=samples.futures,
+                    steps_run=samples.steps_run,
+                    segments=samples.segments,
+                )
                 for samples in self.samples
                 if samples.steps_run <= step
             ]
             shown = [*self.previews[step], *whole]
-            if sum(len(some.sample_indices) for some in shown) < self.num_rows:
+            # A sample that was cut was shown at its last step, and is whole too.
+            if len({int(i) for some in shown for i in some.sample_indices}) < self.num_rows:
                 break
             found.append((step, shown))
             del self.previews[step]
@@ -72,36 +78,43 @@ class Job:
 
     def preview(self, steps_run: int, shown: Sequence[Shown]) -> Preview:
         """The futures of all samples after so many steps."""
-        shortest = min(some.futures.shape[1] for some in shown)
+        num_frames = self._num_frames(shown)
         return Preview(
             request_id=self.request_id,
             futures=self._assembled(
-                shown, num_frames=min(shortest, self.request.horizon or shortest)
+                shown, num_frames=min(num_frames, self.request.horizon or num_frames)
             ),
             steps_run=steps_run,
             steps_of=self.steps_of,
+            segments=self._segments(shown),
         )
 
     def result(self) -> Result:
         """What the samples make, which are all whole."""
-        segments = {
-            int(i): some
-            for part in self.samples
-            for i, some in zip(part.sample_indices, part.segments, strict=False)
-        }
-        lengths = [part.futures.shape[1] for part in self.samples]
-        num_frames = max(lengths) if segments else min(lengths)
         reasons: set[StoppedBy] = {part.stopped_by for part in self.samples}
-        in_order = tuple(segments[i] for i in range(self.num_rows) if i in segments)
         return Result(
             request_id=self.request_id,
-            futures=self._assembled(self.samples, num_frames=num_frames),
+            futures=self._assembled(self.samples, num_frames=self._num_frames(self.samples)),
             steps_run=max(part.steps_run for part in self.samples),
             steps_of=self.steps_of,
             stopped_by=next(reason for reason in _BY_WEIGHT if reason in reasons),
-            segments=in_order * self._copies,
+            segments=self._segments(self.samples),
             queued_s=self.queued_s(self.added_s),
         )
+
+    def _num_frames(self, parts: Sequence[Shown | Samples]) -> int:
+        """The longest future of actions; else the shortest, which all samples have reached."""
+        lengths: list[int] = [part.futures.shape[1] for part in parts]
+        return max(lengths) if self.request.actions else min(lengths)
+
+    def _segments(self, parts: Sequence[Shown | Samples]) -> tuple[tuple[Segment, ...], ...]:
+        """Those of all samples, in order; of actions alone."""
+        found = {
+            int(i): some
+            for part in parts
+            for i, some in zip(part.sample_indices, part.segments, strict=False)
+        }
+        return tuple(found[i] for i in range(self.num_rows) if i in found) * self._copies
 
     @property
     def _copies(self) -> int:

@@ -13,7 +13,7 @@ from service.engine.costs import Costs
 from service.engine.runner import Runner
 from service.engine.sampling import noise
 from service.engine.stopping import rest_frames
-from service.engine.trajectory import Request, Samples, Segment, StoppedBy
+from service.engine.trajectory import Request, Samples, Segment, Shown, StoppedBy
 
 NEXT = "next_"
 EARLIEST_END = "earliest_end"
@@ -25,7 +25,7 @@ class Performance:
 
     ``past`` has the frames of each before this action, those of the observation included, and
     ``segments`` the actions that made them; ``chunks`` are those of this action so far. Before its
-    first there is no ``noise``.
+    first there is no ``noise``. ``steps_run`` are the chunks of each sample, of all its actions.
     """
 
     request_id: int
@@ -35,6 +35,7 @@ class Performance:
     context: Context
     past: tuple[Float[np.ndarray, "_ J 3"], ...]
     segments: tuple[tuple[Segment, ...], ...]
+    steps_run: Int64[np.ndarray, "n"]
     chunks: tuple[Float[np.ndarray, "n _ J 3"], ...] = ()
     noise: Float[np.ndarray, "n ..."] | None = None
     is_cut: bool = False
@@ -55,12 +56,24 @@ class Performance:
 
     @property
     def steps_behind(self) -> int:
-        """1 once there are frames to show."""
-        return int(bool(self.chunks) or self.actions_ended > 0)
+        """The chunks that every sample has."""
+        return int(self.steps_run.min())
 
     @property
-    def shown(self) -> None:
-        """Nothing: a performance is one step."""
+    def shown(self) -> list[Shown]:
+        """The frames of each sample so far, where the request asks for previews."""
+        if not self.request.previews:
+            return []
+        found = [self.so_far(row) for row in range(len(self))]
+        return [
+            Shown(
+                sample_indices=self.sample_indices[row : row + 1],
+                futures=frames[None, len(self.request.observation) :],
+                steps_run=int(self.steps_run[row]),
+                segments=(segments,),
+            )
+            for row, (frames, segments) in enumerate(found)
+        ]
 
     def cut(self) -> "Performance":
         """The same samples, which end in their next turn with the frames that they have."""
@@ -81,9 +94,16 @@ class Performance:
             context=self.context.part(rows),
             past=tuple(self.past[row] for row in rows),
             segments=tuple(self.segments[row] for row in rows),
+            steps_run=self.steps_run[rows],
             chunks=tuple(chunk[rows] for chunk in self.chunks),
             noise=None if self.noise is None else self.noise[rows],
         )
+
+    def so_far(self, row: int) -> tuple[Float[np.ndarray, "F J 3"], tuple[Segment, ...]]:
+        """One sample's frames and segments as they stand."""
+        if not self.chunks:
+            return self.past[row], self.segments[row]
+        return self.ended(row, self.num_made, stopped=False)
 
     def ended(
         self, row: int, num_frames: int, *, stopped: bool
@@ -112,6 +132,10 @@ class Performer:
         self._encoder_draws = runner.takes("encoder", "noise")
         self._draws = self._encoder_draws or runner.takes("decoder", "noise")
 
+    def steps_of(self, request: Request) -> int:
+        """The chunks of all its actions at their longest."""
+        return self._turns(request, num_actions=len(request.actions))
+
     def start(self, request_id: int, request: Request) -> list[Performance]:
         """All samples before their first action; they share a context."""
         num_samples = request.num_samples if self._draws else 1
@@ -119,10 +143,11 @@ class Performer:
             request_id=request_id,
             request=request,
             sample_indices=np.arange(num_samples),
-            turns_left=self._turns(request, num_actions=len(request.actions)),
+            turns_left=self.steps_of(request),
             context=_before(request.observation[None], action=request.actions[0]),
             past=(request.observation,) * num_samples,
             segments=((),) * num_samples,
+            steps_run=np.zeros(num_samples, np.int64),
         )
         return [samples]
 
@@ -162,6 +187,7 @@ class Performer:
         part = replace(
             part,
             turns_left=part.turns_left - 1,
+            steps_run=part.steps_run + 1,
             chunks=(*part.chunks, chunk),
             context=Context(tensors=context.tensors | state, encoded=True),
         )
@@ -225,13 +251,9 @@ class Performer:
 
     def _cut(self, part: Performance) -> list[Samples]:
         """Samples that were cut: their action stops with the frames so far."""
-        made = part.num_made
-        found = [
-            part.ended(row, made, stopped=False) if made else (part.past[row], part.segments[row])
-            for row in range(len(part))
-        ]
         return [
-            self._whole(part, row, *one, stopped_by="deadline") for row, one in enumerate(found)
+            self._whole(part, row, *part.so_far(row), stopped_by="deadline")
+            for row in range(len(part))
         ]
 
     def _whole(
@@ -247,7 +269,7 @@ class Performer:
             request_id=part.request_id,
             sample_indices=part.sample_indices[row : row + 1],
             futures=frames[None, self._manifest.num_observed :],
-            steps_run=1,
+            steps_run=int(part.steps_run[row]),
             stopped_by=stopped_by,
             segments=(segments,),
         )
@@ -305,6 +327,7 @@ def _one(parts: Sequence[Performance]) -> Performance:
         else joined([(part.context, len(part)) for part in parts]),
         past=tuple(past for part in parts for past in part.past),
         segments=tuple(segments for part in parts for segments in part.segments),
+        steps_run=np.concatenate([part.steps_run for part in parts]),
         chunks=tuple(map(np.concatenate, zip(*(part.chunks for part in parts), strict=True))),
         noise=np.concatenate(drawn) if drawn else None,
     )

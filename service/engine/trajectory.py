@@ -26,7 +26,7 @@ class Request:
     is ready then. A sample stops as soon as a step moved no joint of its future by ``tolerance_m``.
     Frames of the ``horizon`` beyond the bundle's come from legs that re-enter the last ones; a
     bundle that performs actions takes neither. ``previews`` asks for a Preview after each step but
-    the last, which the Result follows.
+    the last, which the Result follows; a step of one that performs is a chunk of frames.
     """
 
     observation: Float[np.ndarray, "T J 3"]
@@ -62,7 +62,7 @@ class Result:
     Futures of actions differ in length: H is that of the longest, the others repeat their last
     frame, and the end of a sample's last segment is its length. Otherwise H is the horizon that was
     asked for, or less where the deadline came before the last leg. ``steps_run`` are the most that
-    one row ran, of ``steps_of``, over all legs; ``queued_s`` passed before the first of them.
+    one row ran, of ``steps_of``, over all legs or actions; ``queued_s`` passed before the first.
     """
 
     request_id: int
@@ -76,12 +76,17 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Preview:
-    """The futures of a request as they stand after a step: those that fewer steps would give."""
+    """The futures of a request as they stand after a step: those that fewer steps would give.
+
+    Of actions it is the frames so far, with their segments as a Result has them. The last one that
+    has not ended is not ``stopped``, and may yet end some frames before those of its last chunk.
+    """
 
     request_id: int
     futures: Float[np.ndarray, "N H J 3"]
     steps_run: int
     steps_of: int
+    segments: tuple[tuple[Segment, ...], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -105,6 +110,16 @@ class Samples:
     segments: tuple[tuple[Segment, ...], ...] = ()
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Shown:
+    """Futures of some samples as they stand after so many steps of each."""
+
+    sample_indices: Shaped[np.ndarray, "n"]
+    futures: Float[np.ndarray, "n H J 3"]
+    steps_run: int
+    segments: tuple[tuple[Segment, ...], ...] = ()
+
+
 @runtime_checkable
 class Trajectory(Rows, Protocol):
     """Samples of one request on their way; how they advance is their own affair."""
@@ -122,7 +137,7 @@ class Trajectory(Rows, Protocol):
         """Which of the request's samples they are."""
 
     @property
-    def shown(self) -> Float[np.ndarray, "n H J 3"] | None:
+    def shown(self) -> list[Shown]:
         """Their futures as they stand, where the request asks for previews."""
 
     def cut(self: SelfT) -> SelfT:
@@ -134,6 +149,9 @@ TrajectoryT = TypeVar("TrajectoryT", bound=Trajectory)
 
 class Progress(Protocol[TrajectoryT]):
     """A way of a request's samples to their futures."""
+
+    def steps_of(self, request: Request) -> int:
+        """The steps of a request, were it to run them all."""
 
     def start(self, request_id: int, request: Request) -> list[TrajectoryT]:
         """All samples of a request, or a single one where they are all alike; no graph runs."""

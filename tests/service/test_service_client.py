@@ -21,7 +21,13 @@ from service.exchange import (
     ServerFailedError,
 )
 from service.media import MSGPACK, decoded
-from service.messages import ActionsOptions, PredictOptions, Preview
+from service.messages import (
+    ActionsOptions,
+    ActionsPrediction,
+    ActionsPreview,
+    PredictOptions,
+    Preview,
+)
 
 OVERLOADED = {"type": "/problems/overloaded", "status": 429, "detail": "the queue is full."}
 
@@ -128,6 +134,37 @@ def test_stream_gives_previews_and_then_the_prediction(service: Service):
         assert runs == sorted(set(runs))
         np.testing.assert_allclose(last.futures, plain.futures, atol=1e-6)
         assert (last.steps, last.seed) == (plain.steps, 5)
+
+
+def test_stream_of_actions_gives_previews_and_then_the_prediction(performing_service: Service):
+    options: ActionsOptions = {"num_samples": 2, "seed": 5}
+    actions = ["reach", "wave"]
+
+    async def asked() -> list[Any]:
+        transport = httpx.ASGITransport(app=performing_service.app)
+        async with AsyncClient(transport=transport) as client:
+            stream = client.stream_actions(walking(), actions, **options)
+            return [event async for event in stream]
+
+    with Client(transport=performing_service) as client:
+        plain = client.predict_actions(walking(), actions, **options)
+        *previews, final = client.stream_actions(walking(), actions, **options)
+        with pytest.raises(BadRequestError, match="found 'octopus'"):
+            next(client.stream_actions(walking(), ["octopus"]))
+    *also_previews, also_final = performing_service.run(asked())
+    assert previews
+    for events, last in ((previews, final), (also_previews, also_final)):
+        runs = [event.run for event in events]
+        assert runs == sorted(set(runs))
+        for event in events:
+            assert isinstance(event, ActionsPreview)
+            assert event.of == 16
+            ends = [segments[-1].end for segments in event.segments]
+            assert [len(future) for future in event.futures] == ends
+        assert isinstance(last, ActionsPrediction)
+        assert last.segments == plain.segments
+        for future, expected in zip(last.futures, plain.futures, strict=True):
+            np.testing.assert_allclose(future, expected, atol=1e-6)
 
 
 def test_options_are_those_of_the_service():

@@ -19,9 +19,11 @@ def asked(**fields: Any) -> bytes:
     return dumped({"poses": WALK, "seed": 4, "num_samples": 3, **fields})
 
 
-def streamed(service: Service, body: bytes, accept: str) -> httpx.Response:
+def streamed(
+    service: Service, body: bytes, accept: str, *, path: str = "/predict"
+) -> httpx.Response:
     headers = JSON | {"accept": accept, "x-request-id": "me"}
-    return service.request("POST", "/predict", content=body, headers=headers)
+    return service.request("POST", path, content=body, headers=headers)
 
 
 def events(response: httpx.Response) -> list[tuple[str, bytes]]:
@@ -76,6 +78,79 @@ def test_stream_tells_what_was_accepted_and_shows_each_step(service: Service):
         )
         assert preview["futures"] == early["futures"]
     assert set(final["timing_ms"]) == {"queue", "engine", "answer"}
+
+
+PERFORMED = "/predict_actions"
+
+
+@pytest.mark.parametrize("accept", [SSE, NDJSON])
+@pytest.mark.parametrize("actions", [["wave"], ["reach", "wave", "crouch"]])
+@pytest.mark.parametrize("fps", [30.0, 25.0])
+def test_stream_of_actions_grows_to_the_plain_answer(
+    performing_service: Service, accept: str, actions: list[str], fps: float
+):
+    body = asked(actions=actions, fps=fps, num_samples=5)
+    response = streamed(performing_service, body, accept, path=PERFORMED)
+    assert response.headers["content-type"].split(";")[0] == accept
+    found = events(response)
+    names = [name for name, _ in found]
+    assert names[0] == "accepted"
+    assert names[-2:] == ["final", "end"]
+    assert set(names[1:-2]) == {"preview"}
+    plain = streamed(performing_service, body, "application/json", path=PERFORMED).content
+    assert untimed(dict(found)["final"]) == untimed(plain)
+    accepted, *previews = (orjson.loads(data) for _, data in found[:-2])
+    final, most = orjson.loads(plain), 8 * len(actions)
+    assert accepted == {"id": "me", "model": final["model"], "seed": 4, "steps": {"of": most}}
+    runs = [preview["steps"]["run"] for preview in previews]
+    assert runs == sorted(set(runs))
+    assert runs[-1] < most
+    for preview in previews:
+        assert (preview["id"], preview["steps"]["of"]) == ("me", most)
+        for now, then in zip(preview["futures"], final["futures"], strict=True):
+            assert now["num_frames"] == len(now["poses"]) == now["segments"][-1]["end"]
+            *ended, last = now["segments"]
+            assert ended == then["segments"][: len(ended)]
+            assert last["action"] == actions[len(ended)]
+            if last["stopped"]:
+                assert last == then["segments"][len(ended)]
+            if fps == 30.0:  # at another rate the last frame aims beyond what is there
+                same = min(last["end"], then["segments"][len(ended)]["end"])
+                assert now["poses"][:same] == then["poses"][:same]
+
+
+def test_actions_at_fault_get_a_problem_and_no_stream(performing_service: Service):
+    response = streamed(performing_service, asked(actions=["fly"]), SSE, path=PERFORMED)
+    assert (response.status_code, response.json()["pointer"]) == (422, "/actions/0")
+    assert response.headers["content-type"] == "application/problem+json"
+
+
+def test_stream_of_actions_that_fails_ends_in_an_error(performing_service: Service):
+    body = dumped({"poses": walking(speed=99.0), "actions": ["wave", "reach"], "num_samples": 2})
+    found = events(streamed(performing_service, body, NDJSON, path=PERFORMED))
+    assert [name for name, _ in found] == ["accepted", "error"]
+    assert orjson.loads(found[-1][1])["type"] == "/problems/prediction-failed"
+
+
+def test_stream_of_actions_that_breaks_off_looks_like_none_that_is_whole(
+    bundles_with_actions: Path,
+):
+    body = dumped({"poses": WALK, "actions": ["wave", "reach"] * 8, "num_samples": 1000})
+    with Live(bundles_with_actions, **SLOW) as live:
+        with live.sock(body, path=PERFORMED, accept=NDJSON) as connection:
+            until(lambda: live.under_way() == 1)
+            assert httpx.delete(f"{live.url}/requests/mine").status_code == 204
+            until(lambda: live.under_way() == 0)
+            answer = b""
+            while b"/problems/cancelled" not in answer:
+                answer += connection.recv(2**16) or pytest.fail(repr(answer))
+            assert b'"final"' not in answer
+            assert b'{"event":"end"' not in answer
+        connection = live.sock(body, path=PERFORMED, accept=SSE)
+        until(lambda: live.under_way() == 1)
+        connection.close()
+        until(lambda: live.under_way() == 0)
+        assert live.app.state.streams == set()
 
 
 def test_drawn_seed_is_told_before_the_first_preview(service: Service):

@@ -3,11 +3,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice, zip_longest
 from pathlib import Path
-from threading import Thread
 
 import numpy as np
 import onnxruntime as ort
 import pytest
+from threaded import run_by_threads
 from tiny_bundles import NUM_STEPS, X_T_SHAPE, walking
 
 from models.bundle import read_manifest
@@ -84,25 +84,6 @@ def slow_obvious_future(
     return graph["decoder"].run(None, feed)[0][0]
 
 
-def run_by_threads(
-    engine: Engine, requests: Sequence[Request], *, threads: int
-) -> list[list[Result | Failure | Preview]]:
-    """What became of each request."""
-    events: dict[int, list[Result | Failure | Preview]] = {engine.add(r): [] for r in requests}
-
-    def drive() -> None:
-        while engine.num_requests:
-            for event in engine.turn(shares=threads).events:
-                events[event.request_id].append(event)
-
-    drivers = [Thread(target=drive) for _ in range(threads)]
-    for driver in drivers:
-        driver.start()
-    for driver in drivers:
-        driver.join()
-    return list(events.values())
-
-
 @pytest.mark.parametrize("num_steps", [1, 4, NUM_STEPS])
 @pytest.mark.parametrize("bundle", ["diffusion", "stochastic"])
 def test_engine_equals_a_loop_over_the_graphs(
@@ -136,6 +117,22 @@ def test_stride_walks_the_whole_chain_in_fewer_steps(
         expected = slow_obvious_future(folder, seed=7, sample=sample, chain=chain)
         np.testing.assert_allclose(result.futures[sample], expected, atol=1e-6)
     assert (result.steps_run, result.steps_of, result.stopped_by) == (len(chain), len(chain), "end")
+
+
+@pytest.mark.parametrize(
+    ("num_steps", "run", "stopped_by"),
+    [(None, 3, "end"), (2, 2, "num_steps"), (3, 3, "end"), (5, 5, "end")],
+)
+def test_only_who_asks_for_fewer_steps_than_the_default_is_told_so(
+    bundles: Path, num_steps: int | None, run: int, stopped_by: str
+):
+    folder = bundles / "diffusion"
+    manifest = read_manifest(folder)
+    assert manifest.schedule is not None
+    plan = manifest.schedule.model_copy(update={"default_steps": 3})
+    runner = Runner(manifest.model_copy(update={"schedule": plan}), folder, threads=1)
+    result = predict(Engine(runner), request(7, num_steps=num_steps))
+    assert (result.steps_run, result.steps_of, result.stopped_by) == (run, 10, stopped_by)
 
 
 def test_same_seed_gives_the_same_bytes_and_another_seed_another_future(bundles: Path):

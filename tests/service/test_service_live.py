@@ -42,14 +42,15 @@ def test_futures_are_those_that_predict_gives_for_the_same_frames(service: Servi
 
     ready, answers = service.run(streamed())
     for message in answers:
-        seen = poses[: round(message["t"] * FPS) + 1]
-        body = dumped({"poses": [nulled(pose) for pose in seen], **OPTIONS})
+        count = round(message["t"] * FPS) + 1
+        seen = {"poses": [nulled(pose) for pose in poses[:count]], "timestamps": TIMES[:count]}
+        body = dumped(seen | {"fps": 30.0} | OPTIONS)
         headers = {"content-type": "application/json", "x-request-id": message["answer"]["id"]}
         plain = service.request("POST", "/predict", content=body, headers=headers).content
         assert untimed(orjson.dumps(message["answer"])) == untimed(
             orjson.dumps(orjson.loads(plain))
         )
-    assert "left_hand is null in 1 of the last 16" in answers[-1]["answer"]["warnings"][0]
+    assert "left_hand is null in 1 of the last 17" in answers[-1]["answer"]["warnings"][0]
     assert ready["joints"] == answers[-1]["answer"]["joints"]
     assert (ready["fps"], ready["num_observed"], ready["resumed"]) == (30.0, 15, False)
 
@@ -138,6 +139,26 @@ BAD = {
         {"type": "frame", "t": 5.0, "pose": [["x", 2.0, 3.0], *WALK[0][1:].tolist()]},
         ("/problems/invalid-poses", "/pose/0/0", '"x"'),
     ),
+    "a confidence too many": (
+        {"type": "frame", "t": 5.0, "pose": WALK[0], "confidence": [1.0] * 22},
+        ("/problems/invalid-field", "/confidence", "a list of 22"),
+    ),
+    "a confidence over 1": (
+        {"type": "frame", "t": 5.0, "pose": WALK[0], "confidence": [1.0] * 20 + [1.5]},
+        ("/problems/invalid-field", "/confidence/20", "1.5"),
+    ),
+    "a confidence under 0": (
+        {"type": "frame", "t": 5.0, "pose": WALK[0], "confidence": [-0.1] + [1.0] * 20},
+        ("/problems/invalid-field", "/confidence/0", "-0.1"),
+    ),
+    "a confidence that is null": (
+        {"type": "frame", "t": 5.0, "pose": WALK[0], "confidence": [None] * 21},
+        ("/problems/invalid-field", "/confidence/0", "null"),
+    ),
+    "a confidence for all joints": (
+        {"type": "frame", "t": 5.0, "pose": WALK[0], "confidence": 0.5},
+        ("/problems/invalid-field", "/confidence", "0.5"),
+    ),
     "no pose": (
         {"type": "frame", "t": 5.0},
         ("/problems/invalid-field", "/pose", "nothing"),
@@ -170,6 +191,10 @@ BAD = {
     "poses among the options": (
         {"type": "start", "options": {"poses": []}},
         ("/problems/invalid-field", "/options/poses", "a field that no stream has"),
+    ),
+    "confidence among the options": (
+        {"type": "start", "options": {"confidence": [[1.0] * 21]}},
+        ("/problems/invalid-field", "/options/confidence", "a field that no stream has"),
     ),
     "an unknown model": (
         {"type": "start", "options": {"model": "x"}},
@@ -263,6 +288,53 @@ def test_uneven_frames_of_an_even_motion_are_answered_as_even_ones(service: Serv
 
     expected = service.futures(even, **OPTIONS, fps=30.0)
     np.testing.assert_allclose(service.run(streamed()), expected, atol=2e-4)
+
+
+def test_doubted_frames_at_uneven_times_are_answered_as_predict_answers_them(service: Service):
+    rng = np.random.default_rng(5)
+    times = TIMES + rng.uniform(0.0, 0.02, len(TIMES))
+    poses = WALK + rng.normal(0.0, 0.02, WALK.shape)
+    worth = rng.uniform(0.1, 1.0, WALK.shape[:2])
+    worth[::3] = 1.0  # what a frame is worth that says nothing of it
+
+    async def streamed() -> dict[str, Any]:
+        async with Stream(service.app) as stream:
+            stream.start(**OPTIONS)
+            for i, (t, pose) in enumerate(zip(times, poses, strict=True)):
+                told = {"confidence": worth[i]} if i % 3 else {}
+                if i % 2:
+                    stream.say_packed(type="frame", t=t, pose=pose, **told)
+                else:
+                    stream.say(type="frame", t=t, pose=pose, **told)
+            while (message := await stream.said_of("futures"))["t"] < times[-1]:
+                pass
+            return message["answer"]
+
+    answer = service.run(streamed())
+    seen = {"poses": poses, "timestamps": times.tolist(), "confidence": worth, "fps": 30.0}
+    expected = service.futures(**seen, **OPTIONS)
+    np.testing.assert_array_equal(answer["futures"], expected)
+    sure = service.futures(**seen | {"confidence": None}, **OPTIONS)
+    assert np.abs(sure - expected).max() > 1e-3
+
+
+def test_a_confidence_that_is_no_number_is_a_problem(service: Service):
+    async def streamed(worth: np.ndarray) -> dict[str, Any]:
+        async with Stream(service.app) as stream:
+            stream.say_packed(type="start", options=OPTIONS)
+            assert (await stream.said())["type"] == "ready"
+            stream.say_packed(type="frame", t=0.0, pose=WALK[0], confidence=worth)
+            return (await stream.said())["problem"]
+
+    unsure = np.full(21, 0.5)
+    unsure[7] = np.nan
+    for worth, pointer, found in (
+        (unsure, "/confidence/7", "NaN"),
+        (np.full((1, 21), 0.5), "/confidence", "a list of 1"),
+        (np.array(0.5), "/confidence", "0.5"),
+    ):
+        problem = service.run(streamed(worth))
+        assert (problem["pointer"], problem["found"]) == (pointer, found)
 
 
 def test_a_reader_that_stops_gets_the_newest_when_it_reads_on(service: Service):

@@ -26,7 +26,21 @@ def test_client_gives_the_futures_of_what_it_pushes(bundles: Path):
                 stream.push(pose, t)
             newest = next(answer for answer in stream if answer.t == TIMES[-1])
             assert stream.latest() is None
-        expected = client.predict(poses, num_samples=3, seed=5)
+        expected = client.predict(poses, timestamps=TIMES.tolist(), num_samples=3, seed=5)
+    np.testing.assert_array_equal(newest.prediction.futures, expected.futures)
+    assert newest.prediction.warnings == expected.warnings
+
+
+def test_client_tells_what_each_joint_is_worth(bundles: Path):
+    worth = np.random.default_rng(2).uniform(0.1, 1.0, WALK.shape[:2])
+    with Live(bundles) as live, Client(live.url) as client:
+        with client.live(rate_hz=60.0, num_samples=3, seed=5) as stream:
+            for pose, t, sure in zip(WALK, TIMES, worth, strict=True):
+                stream.push(pose, t, confidence=sure)
+            newest = next(answer for answer in stream if answer.t == TIMES[-1])
+        expected = client.predict(
+            WALK, timestamps=TIMES.tolist(), fps=FPS, confidence=worth, num_samples=3, seed=5
+        )
     np.testing.assert_array_equal(newest.prediction.futures, expected.futures)
     assert newest.prediction.warnings == expected.warnings
 

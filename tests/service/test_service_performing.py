@@ -1,11 +1,14 @@
 """The engine on bundles that perform actions."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
 import pytest
+from threaded import run_by_threads
 from tiny_bundles import (
     CHUNK_FRAMES,
     FPS,
@@ -19,11 +22,13 @@ from tiny_bundles import (
 )
 
 from models.bundle import read_manifest
-from service.engine.context import Part, Tensors
+from service.engine.context import Context, Part, Tensors
 from service.engine.engine import Engine, predict
+from service.engine.job import Job
+from service.engine.performing import Performance
 from service.engine.runner import Runner
 from service.engine.stopping import rest_frames
-from service.engine.trajectory import Failure, Request, Result, Segment
+from service.engine.trajectory import Failure, Preview, Request, Result, Samples, Segment
 from service.errors import FieldError, NonFiniteError
 
 WALK = walking().astype(np.float32)
@@ -225,6 +230,87 @@ def test_observation_is_encoded_once_and_rows_that_turn_together_in_one_batch(
     # Every row ends its first action, of one chunk, in the same turn.
     predict(Engine(runner), request(0, 1, num_samples=5, max_frames=CHUNK_FRAMES))
     assert runner.calls == [("encoder", 1), ("decoder", 5), ("encoder", 5), ("decoder", 5)]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("actions", [(1,), (2, 0, 1)])
+def test_previews_are_the_frames_so_far_and_change_no_answer(
+    actions_bundle: Path, actions: tuple[int, ...], threads: int
+):
+    some = request(*actions, seed=3, num_samples=20)
+    engine = engine_of(actions_bundle, rows_per_step=7)
+    strangers = [request(1, 2, seed=seed, num_samples=5) for seed in range(3)]
+    asked = replace(some, previews=True)
+    events, *_ = run_by_threads(engine, [asked, *strangers], threads=threads)
+    (result,) = [event for event in events if isinstance(event, Result)]
+    previews = sorted((e for e in events if isinstance(e, Preview)), key=lambda e: e.steps_run)
+    alone = predict(engine, some)
+    assert (result.segments, result.steps_run) == (alone.segments, alone.steps_run)
+    assert result.futures.tobytes() == alone.futures.tobytes()
+    assert [preview.steps_run for preview in previews] == list(range(1, result.steps_run))
+    assert {event.steps_of for event in (*previews, result)} == {len(actions) * 8}
+    for preview in previews:
+        for row in range(20):
+            *ended, last = preview.segments[row]
+            whole = result.segments[row]
+            future, shown = result.futures[row], preview.futures[row]
+            assert tuple(ended) == whole[: len(ended)]
+            if last.stopped:
+                assert last == whole[len(ended)]
+            else:
+                made = last.end - last.start
+                assert made == HORIZON or made % CHUNK_FRAMES == 0
+            same = min(last.end, whole[len(ended)].end)
+            assert shown[:same].tobytes() == future[:same].tobytes()
+            assert np.all(shown[last.end :] == shown[last.end - 1])
+    # Nobody is shown to be farther than their chunks go, nor less far.
+    first = previews[0].segments
+    assert all(0 < segments[-1].end <= CHUNK_FRAMES for segments in first)
+
+
+def test_previews_of_samples_that_are_alike_are_those_of_all(tmp_path: Path):
+    folder = write_actions_bundle(tmp_path / "actions", draws=None)
+    (events,) = run_by_threads(
+        engine_of(folder), [request(0, 1, num_samples=4, previews=True)], threads=1
+    )
+    assert len(events) > 2
+    for event in events:
+        assert isinstance(event, Preview | Result)
+        assert len(event.futures) == len(event.segments) == 4
+
+
+def test_samples_that_were_cut_do_not_stand_for_those_of_another_thread():
+    """Cut rows are whole at the step that they were shown at, and still count once."""
+    some = request(0, num_samples=4, previews=True)
+    job = Job(request_id=1, request=some, steps_of=8, num_rows=4, deadline_s=math.inf, added_s=0.0)
+    frames = np.zeros((2, CHUNK_FRAMES, 21, 3), np.float32)
+    shown = Performance(
+        request_id=1,
+        request=some,
+        sample_indices=np.arange(2),
+        turns_left=7,
+        context=Context(tensors={"observation": WALK[None]}),
+        past=(WALK, WALK),
+        segments=((), ()),
+        steps_run=np.array([1, 1]),
+        chunks=(frames,),
+    )
+    job.show(shown)
+    segment = Segment(action=0, start=0, end=CHUNK_FRAMES, stopped=False)
+    job.put(
+        Samples(
+            request_id=1,
+            sample_indices=np.arange(2),
+            futures=frames,
+            steps_run=1,
+            stopped_by="deadline",
+            segments=((segment,), (segment,)),
+        )
+    )
+    assert job.ready() == []
+    job.show(replace(shown, sample_indices=np.array([2, 3])))
+    ((step, parts),) = job.ready()
+    assert (step, job.preview(step, parts).segments) == (1, ((segment,),) * 4)
 
 
 def test_nan_fails_its_own_request_and_no_other(actions_bundle: Path):

@@ -67,6 +67,28 @@ def test_other_axes_and_units_are_guessed(service: Service, up: Any, units: Any)
     assert answer["problem"]["pointer"] == "/axes/units"
 
 
+ODD = {
+    "up": (Axes(up="y").from_metres(WALK), "axes.up: the shoulders are over the feet along 'y', "),
+    "units": (0.3 * WALK, "axes.units: a leg is 0.2"),
+    "sides": (
+        WALK[:, list(BODY21.mirror)].copy(),
+        "poses: the toes point backwards: left and right ",
+    ),
+}
+
+
+@pytest.mark.parametrize("about", ODD)
+def test_prediction_warns_of_how_the_body_stands_as_the_dry_run_does(service: Service, about: str):
+    poses, warning = ODD[about]
+    answer = service.post({"poses": poses, "num_samples": 1}).json()
+    (said,) = answer["warnings"]
+    assert said.startswith(warning)
+    dry = validated(service, poses)
+    assert dry["warnings"] == answer["warnings"]
+    sentence = said.partition(": ")[2]
+    assert sentences(dry) == {about: sentence[0].upper() + sentence[1:]}
+
+
 def test_swapped_sides_are_said(service: Service):
     swapped = WALK[:, list(BODY21.mirror)]
     assert "left and right look swapped" in sentences(validated(service, swapped))["sides"]

@@ -631,7 +631,10 @@ export type ObservedPoses = {
 /**
  * Occupancy
  *
- * What the futures say of one region; shares of samples, which no measurement has widened.
+ * What the futures say of one region: shares of the samples, not measured probabilities.
+ *
+ * Samples are surer than people are, and no calibration widens them here: a region that none of
+ * them enters may be entered. Measured regions are those of `quantiles`, where `calibrated`.
  */
 export type Occupancy = {
     /**

@@ -9,7 +9,7 @@ from models.motion.axes import UNITS_PER_METRE, Axes
 from models.motion.formats.errors import EmptyMotionError, InvalidNumberError, UnsupportedFileError
 from models.motion.formats.text import LARGEST
 from models.motion.gaps import filled
-from models.motion.guesses import guess_units, guess_up, leg_length
+from models.motion.guesses import body_of, guess_units, guess_up, leg_length
 from models.motion.motion import Motion
 from models.motion.skeleton import SkeletonError, in_tree_order, skeleton_from_names
 from models.motion.trees import guessed_parents
@@ -58,9 +58,8 @@ def point_motion(
     whole = filled(raw, np.arange(len(raw), dtype=float), named.parents)
     tree, order = in_tree_order(name, joints, guessed_parents(named, whole[0]))
     said = [unit for unit in UNITS_PER_METRE if unit == units.strip().lower()]
-    axes = Axes(
-        up=guess_up(whole, named), units=said[0] if said else guess_units(leg_length(whole, named))
-    )
+    body = body_of(whole, named)
+    axes = Axes(up=guess_up(body), units=said[0] if said else guess_units(leg_length(body)))
     return Motion(name=name, skeleton=tree, positions=axes.to_metres(raw[:, order]), fps=fps)
 
 
