@@ -14,9 +14,9 @@ from limits.aio.strategies import MovingWindowRateLimiter
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service import page
 from service.errors import OverloadedError, RateLimitedError, ServiceError, UnauthorisedError
-from service.problems import problem
+from service.http import page
+from service.http.problems import problem
 
 OPEN_PATHS = ("/livez", "/readyz", page.PATH)
 RETRY_FRESH_S = 0.1
