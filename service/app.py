@@ -12,18 +12,19 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from service import files, live, predictions, validation
 from service.catalog import Catalog
-from service.guard import KEY_PROTOCOL, STREAM_PROTOCOL, Guard
-from service.metrics import Metrics
-from service.page import add_page
-from service.problems import add_problem_responses
+from service.http import files, predictions, validation
+from service.http.guard import KEY_PROTOCOL, STREAM_PROTOCOL, Guard
+from service.http.metrics import Metrics
+from service.http.page import add_page
+from service.http.problems import add_problem_responses
+from service.http.telemetry import telemetry_config
+from service.http.visits import Visits
+from service.http.warm_up import warm_up
+from service.live import stream
+from service.live.sessions import Sessions
 from service.routes import health, router
-from service.sessions import Sessions
 from service.settings import Settings
-from service.telemetry import telemetry_config
-from service.visits import Visits
-from service.warm_up import warm_up
 from service.worker import Worker
 
 NICENESS = 10
@@ -89,7 +90,7 @@ def create_app(
     app.include_router(predictions.router)
     app.include_router(files.router)
     app.include_router(validation.router)
-    app.include_router(live.router)
+    app.include_router(stream.router)
     app.include_router(router)
     app.include_router(health)
     add_page(app, pose_landmarker=settings.pose_landmarker)

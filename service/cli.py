@@ -23,11 +23,8 @@ from models.motion.kinematics import inverse_kinematics
 from models.motion.motion import Motion
 from service import server
 from service.app import create_app
-from service.catalog import Catalog
-from service.client import AsyncClient
-from service.errors import FieldError, ServiceError
-from service.exchange import ClientError
-from service.messages import (
+from service.asking.exchange import ClientError
+from service.asking.messages import (
     ActionsOptions,
     ActionsPrediction,
     ActionsPreview,
@@ -35,10 +32,13 @@ from service.messages import (
     PredictOptions,
     Preview,
 )
-from service.replay import recorded, replayed, told
+from service.asking.replay import recorded, replayed, told
+from service.catalog import Catalog
+from service.client import AsyncClient
+from service.errors import FieldError, ServiceError
+from service.poses.skeletons import standard_skeleton
 from service.schemas import MAX_SEED, MAX_STOP_THRESHOLD_M, MAX_STREAM_HZ
 from service.settings import Settings
-from service.skeletons import standard_skeleton
 
 _READ = f"a motion: {', '.join(SUFFIXES)} (.amc beside its .asf), or a folder of OpenPose's frames"
 SENT_S = 10.0  # of a motion, up to now: more than any bundle looks at

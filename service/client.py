@@ -1,6 +1,6 @@
 """Clients of the service, for people who hold arrays: `Client` blocks, `AsyncClient` is awaited.
 
-The errors that they raise are a tree, drawn in `service.exchange`.
+The errors that they raise are a tree, drawn in `service.asking.exchange`.
 """
 
 from collections.abc import AsyncGenerator, Iterator, Sequence
@@ -12,10 +12,10 @@ import httpx
 import numpy as np
 from jaxtyping import Float
 
-from service import messages
-from service.exchange import Exchange, each_now, key, now
-from service.live_client import AsyncLive, Live
-from service.messages import (
+from service.asking import messages
+from service.asking.exchange import Exchange, each_now, key, now
+from service.asking.live import AsyncLive, Live
+from service.asking.messages import (
     ActionsOptions,
     ActionsPrediction,
     ActionsPreview,

@@ -26,10 +26,10 @@ from models.motion.motion import Motion
 from models.motion.skeleton import Skeleton, SkeletonError, joint_map
 from models.motion.trees import without_joints
 from service.errors import PosesError, TooFewFramesError, UnknownSkeletonError
-from service.person import check_person
-from service.poses import confidence_array, poses_array, times_array
-from service.skeletons import OwnJoints, own_skeleton, sent_order
-from service.stance import Finding, stance
+from service.poses.arrays import confidence_array, poses_array, times_array
+from service.poses.person import check_person
+from service.poses.skeletons import OwnJoints, own_skeleton, sent_order
+from service.poses.stance import Finding, stance
 
 Source = Literal["observed", "derived", "imputed"]
 

@@ -9,11 +9,11 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from models.motion.standards import STANDARDS
 from service import schemas
-from service.body import BodyRoute
 from service.catalog import Entry
-from service.dependencies import TheCatalog, TheMetrics, TheSettings
 from service.errors import NotFoundError, UnauthorisedError, UnknownModelError
-from service.problems import declared, problem
+from service.http.body import BodyRoute
+from service.http.dependencies import TheCatalog, TheMetrics, TheSettings
+from service.http.problems import declared, problem
 
 router = APIRouter(route_class=BodyRoute, responses=declared(UnauthorisedError))
 health = APIRouter()

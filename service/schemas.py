@@ -19,14 +19,14 @@ from pydantic_core import PydanticCustomError
 from models.motion.axes import UNITS_PER_METRE, Axes, Handed, Units, Up
 from models.motion.gaps import MIN_CONFIDENCE
 from models.motion.standards import STANDARDS
+from service.answers.occupancy import LEVELS, MAX_MARGIN_M, MAX_REGIONS, Box, Capsule, Query, Region
+from service.answers.quantiles import DEFAULT_LEVELS
 from service.engine.trajectory import StoppedBy
 from service.example import ACTIONS_EXAMPLE, EXAMPLE
 from service.futures import BoneLengths
 from service.observation import MAX_FPS, MIN_FPS, Source
-from service.occupancy import LEVELS, MAX_MARGIN_M, MAX_REGIONS, Box, Capsule, Query, Region
-from service.quantiles import DEFAULT_LEVELS
-from service.skeletons import OwnJoints
-from service.stance import About
+from service.poses.skeletons import OwnJoints
+from service.poses.stance import About
 
 MAX_SEED = 2**53 - 1  # the largest integer that every JSON reader keeps
 MAX_ACTIONS = 16

@@ -10,7 +10,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.app import create_app, drain
-from service.logs import log_as_json
+from service.http.logs import log_as_json
 from service.settings import Settings
 
 GRACE_S = 5  # for answers that are written but not yet read

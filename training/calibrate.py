@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from tqdm import tqdm
 
 from models.bundle import CalibrationSpec, Manifest, read_manifest, write_calibration
+from service.answers.quantiles import regions, widening
 from service.engine.engine import Engine
 from service.engine.runner import Runner
-from service.quantiles import regions, widening
 from training.data.corpora import take_name
 from training.data.store import Store
 from training.evaluate import (

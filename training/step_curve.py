@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from models.bundle import read_manifest
+from service.answers.quantiles import regions
 from service.engine.engine import Engine, predict
 from service.engine.runner import Runner
 from service.engine.trajectory import Request
-from service.quantiles import regions
 from training.contact_sheet import save_small
 from training.data.store import Store
 from training.evaluate import Cutting, Group, common_shape, cut_group, learnt_from, trained_on

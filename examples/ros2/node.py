@@ -17,8 +17,8 @@ from tf2_ros import Buffer, TransformException, TransformListener
 from visualization_msgs.msg import Marker, MarkerArray
 
 from models.motion.skeleton import BODY21
+from service.asking.exchange import ProblemError
 from service.client import Client
-from service.exchange import ProblemError
 
 
 class Futures(Node):

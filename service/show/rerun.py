@@ -7,7 +7,7 @@ import numpy as np
 import rerun
 from jaxtyping import Float
 
-from service.messages import ActionsPrediction, Prediction
+from service.asking.messages import ActionsPrediction, Prediction
 from service.show.bones import OBSERVED_RGB, bones, future_rgb, parents_of
 
 RADIUS_M = 0.008

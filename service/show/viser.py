@@ -6,7 +6,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from service.messages import ActionsPrediction, Prediction
+from service.asking.messages import ActionsPrediction, Prediction
 from service.show.bones import OBSERVED_RGB, bones, future_rgb, parents_of
 
 THICKNESS_M = 0.012

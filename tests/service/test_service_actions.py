@@ -11,13 +11,13 @@ from tiny_bundles import FPS, HORIZON, LABELS, MIN_FRAMES, walking
 from models.bundle import Manifest, read_manifest
 from models.motion.kinematics import bone_lengths
 from models.motion.skeleton import BODY21, H36M17, joint_map
-from service.actions import action_indices, max_frames
 from service.catalog import Catalog
 from service.engine.engine import Engine, predict
 from service.engine.runner import Runner
 from service.engine.trajectory import Request, Segment
 from service.errors import FieldError, UnknownActionError
 from service.futures import caller_segments
+from service.poses.actions import action_indices, max_frames
 
 WALK = walking()
 PATH = "/predict_actions"

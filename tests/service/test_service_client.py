@@ -12,22 +12,22 @@ from starlette.responses import Response, StreamingResponse
 from tiny_bundles import walking
 
 from service import schemas
-from service.client import AsyncClient, Client
-from service.exchange import (
+from service.asking.exchange import (
     BadRequestError,
     BusyError,
     ConnectionFailedError,
     CutStreamError,
     ServerFailedError,
 )
-from service.media import MSGPACK, decoded
-from service.messages import (
+from service.asking.messages import (
     ActionsOptions,
     ActionsPrediction,
     ActionsPreview,
     PredictOptions,
     Preview,
 )
+from service.client import AsyncClient, Client
+from service.media import MSGPACK, decoded
 
 OVERLOADED = {"type": "/problems/overloaded", "status": 429, "detail": "the queue is full."}
 

@@ -616,7 +616,7 @@ def test_a_stream_is_one_line_of_the_log(service: Service, caplog: pytest.LogCap
             stream.say(type="?")
             await stream.said()
 
-    with caplog.at_level("INFO", logger="service.visits"):
+    with caplog.at_level("INFO", logger="service.http.visits"):
         service.run(streamed())
     (facts,) = [record.facts for record in caplog.records if hasattr(record, "facts")]
     assert (facts["route"], facts["status"], facts["outcome"]) == ("/stream", 101, "ok")

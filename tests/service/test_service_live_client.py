@@ -10,8 +10,8 @@ from live import Live, until
 from tiny_bundles import FPS, walking
 from websockets.sync.client import connect
 
+from service.asking.exchange import BadRequestError, ClientError, ConnectionFailedError
 from service.client import AsyncClient, Client
-from service.exchange import BadRequestError, ClientError, ConnectionFailedError
 
 WALK = walking(30)
 TIMES = np.arange(30) / FPS

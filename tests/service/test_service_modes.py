@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.modes import Mode, distances_um, modes
+from service.answers.modes import Mode, distances_um, modes
 
 
 def some_futures(seed: int, count: int, *, kinds: int | None = None) -> np.ndarray:

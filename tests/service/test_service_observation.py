@@ -13,7 +13,7 @@ from models.motion.skeleton import BODY21, H36M17, joint_map
 from service.errors import InputError, PosesError, TooFewFramesError, UnknownSkeletonError
 from service.futures import caller_futures
 from service.observation import Observation, frames_needed, read_observation
-from service.skeletons import OwnJoints
+from service.poses.skeletons import OwnJoints
 
 SAME_BUNDLE = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 

@@ -6,7 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from service.occupancy import Box, Capsule, Region, body_distances, occupancy, segment_distances
+from service.answers.occupancy import (
+    Box,
+    Capsule,
+    Region,
+    body_distances,
+    occupancy,
+    segment_distances,
+)
 
 UNIT = Box(centre=np.zeros(3), size=np.array([2.0, 2.0, 2.0]))
 numbers = st.floats(-5.0, 5.0).map(lambda x: round(x, 3))

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from tiny_bundles import walking
 
 from service.errors import OverloadedError
-from service.problems import problem
+from service.http.problems import problem
 from service.settings import Settings
 
 BODY = dumped({"poses": walking(), "num_samples": 1})

@@ -5,8 +5,8 @@ import pytest
 
 from models.bundle import CalibrationSpec
 from models.motion.kinematics import rotate_yaw
+from service.answers.quantiles import MIN_SAMPLES, check_levels, regions
 from service.errors import FieldError
-from service.quantiles import MIN_SAMPLES, check_levels, regions
 
 CALIBRATION = CalibrationSpec(
     levels=(0.5, 0.9),

@@ -11,11 +11,11 @@ from typer.testing import CliRunner, Result
 from models.motion.formats.bvh import read_bvh, write_bvh
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21
+from service.asking.exchange import BadRequestError
+from service.asking.messages import LivePrediction
+from service.asking.replay import recorded, replayed, told
 from service.cli import app
 from service.client import AsyncClient, Client
-from service.exchange import BadRequestError
-from service.messages import LivePrediction
-from service.replay import recorded, replayed, told
 
 
 @pytest.fixture(autouse=True)

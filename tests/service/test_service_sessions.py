@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from models.motion.axes import Axes
 from models.motion.gaps import num_even
 from service.errors import FieldError
-from service.sessions import FRAMES_PER_PERIOD, GAP_S, Frame, History, Session, Sessions, Watch
+from service.live.sessions import FRAMES_PER_PERIOD, GAP_S, Frame, History, Session, Sessions, Watch
 
 FPS, NUM_FRAMES = 30.0, 15
 WATCH = Watch(joints=("hips", "head"), axes=Axes(), fps=FPS, num_frames=NUM_FRAMES)

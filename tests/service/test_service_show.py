@@ -10,8 +10,8 @@ from in_memory import Service
 from tiny_bundles import walking
 
 from models.motion.skeleton import BODY21
+from service.asking.messages import ActionsPrediction, Prediction
 from service.client import Client
-from service.messages import ActionsPrediction, Prediction
 from service.show.bones import bones, future_rgb, parents_of
 
 WALK = walking()

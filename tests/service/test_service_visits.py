@@ -14,9 +14,9 @@ from in_memory import JSON, Service, dumped
 from prometheus_client.parser import text_string_to_metric_families
 from tiny_bundles import walking
 
-from service import telemetry
 from service.errors import ServiceError
-from service.logs import JsonFormatter
+from service.http import telemetry
+from service.http.logs import JsonFormatter
 
 POSES = walking() + 0.123456
 
@@ -112,7 +112,7 @@ def test_log_has_a_line_of_json_for_each_request_and_no_poses(
     caplog.set_level(logging.DEBUG)
     posted(fresh, num_steps=4)
     posted(fresh, poses=[[[0.123456] * 3] * 21] * 15)
-    good, bad = (line for line in lines(caplog) if line["logger"] == "service.visits")
+    good, bad = (line for line in lines(caplog) if line["logger"] == "service.http.visits")
     assert {"time", "duration_ms", "queue_ms", "engine_ms", "answer_ms", "digest"} <= set(good)
     expected = {
         "level": "info", "message": "request", "method": "POST", "route": "/predict",

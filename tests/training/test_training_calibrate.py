@@ -8,10 +8,10 @@ import pytest
 from people import small_store
 
 from models.bundle import SkeletonSpec, read_manifest
+from service.answers.quantiles import regions
 from service.engine.engine import Engine
 from service.engine.runner import Runner
 from service.errors import FieldError
-from service.quantiles import regions
 from training.calibrate import calibrate
 from training.data.store import Store
 from training.data.windows import Windows, cut

@@ -11,7 +11,7 @@ from models.motion.gaps import filled
 from models.motion.guesses import Body, body_of
 from models.motion.trees import without_joints
 from service.observation import Seen, sources
-from service.stance import Finding, guessed_axes, stance, turned
+from service.poses.stance import Finding, guessed_axes, stance, turned
 
 LIMBS = tuple(
     (f"{side}_{upper}", f"{side}_{lower}")

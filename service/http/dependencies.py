@@ -5,9 +5,9 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from service.catalog import Catalog
-from service.metrics import Metrics
+from service.http.metrics import Metrics
+from service.http.visits import Visit
 from service.settings import Settings
-from service.visits import Visit
 
 
 def settings_of(request: Request) -> Settings:

@@ -14,8 +14,6 @@ from models.motion.formats.files import SUFFIXES, read_motion
 from models.motion.formats.pose_json import request_fields, with_nulls
 from models.motion.motion import Motion
 from service import schemas
-from service.body import BodyRoute, read_body
-from service.dependencies import TheSettings
 from service.errors import (
     BodyTooLargeError,
     FieldError,
@@ -25,8 +23,10 @@ from service.errors import (
     RateLimitedError,
     UnauthorisedError,
 )
+from service.http.body import BodyRoute, read_body
+from service.http.dependencies import TheSettings
+from service.http.problems import declared
 from service.media import DOCUMENTS, JSON, accepted, encoded
-from service.problems import declared
 
 MAX_FPS = 60.0
 ARCHIVE = ".zip"

@@ -7,14 +7,14 @@ from time import perf_counter
 import orjson
 from fastapi import Request, Response
 
-from service.answer import Answer
-from service.delivery import Stream, event, unless_gone
-from service.dependencies import metrics_of, settings_of, visit_of
+from service.answers.answer import Answer
 from service.engine import trajectory
 from service.errors import OverloadedError, UnavailableError
+from service.http.delivery import Stream, event, unless_gone
+from service.http.dependencies import metrics_of, settings_of, visit_of
+from service.http.telemetry import record_stages
+from service.http.visits import CLIENT_GONE
 from service.media import MOTIONS, STREAMS
-from service.telemetry import record_stages
-from service.visits import CLIENT_GONE
 from service.worker import Timing, Worker
 
 

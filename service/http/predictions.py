@@ -6,8 +6,6 @@ from typing import Annotated, Any, TypeVar
 from fastapi import APIRouter, Header, Request, Response
 
 from service import schemas
-from service.body import BodyRoute
-from service.dependencies import TheCatalog, TheSettings, visit_of
 from service.errors import (
     BodyTooLargeError,
     CancelledRequestError,
@@ -23,10 +21,12 @@ from service.errors import (
     UnavailableError,
     UnknownRequestError,
 )
+from service.http.body import BodyRoute
+from service.http.dependencies import TheCatalog, TheSettings, visit_of
+from service.http.plans import deadline_of, planned, prepared, prepared_actions
+from service.http.problems import declared
+from service.http.replies import replied
 from service.media import BVH, DOCUMENTS, GLB, MOTIONS, MSGPACK, NPZ, STREAMS, ZIP, accepted
-from service.plans import deadline_of, planned, prepared, prepared_actions
-from service.problems import declared
-from service.replies import replied
 
 _RouteT = TypeVar("_RouteT", bound=Callable[..., Any])
 

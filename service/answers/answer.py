@@ -11,14 +11,14 @@ from jaxtyping import Float
 
 from models.bundle import Manifest
 from models.motion.axes import UNITS_PER_METRE
-from service.downloads import download
+from service.answers.downloads import download
+from service.answers.modes import modes
+from service.answers.occupancy import Query
+from service.answers.quantiles import regions
 from service.engine.trajectory import Preview, Result, Segment
 from service.futures import DECIMALS, BoneLengths, caller_futures, caller_segments, written
 from service.media import MOTIONS, encoded
-from service.modes import modes
 from service.observation import Observation
-from service.occupancy import Query
-from service.quantiles import regions
 from service.worker import Timing
 
 _IN_FILES = ("futures", "quantiles")

@@ -15,10 +15,10 @@ from limits.aio.strategies import MovingWindowRateLimiter
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service import page
 from service.errors import OverloadedError, RateLimitedError, ServiceError, UnauthorisedError
-from service.problems import problem
-from service.visits import OWN
+from service.http import page
+from service.http.problems import problem
+from service.http.visits import OWN
 
 STREAM_PROTOCOL = "posefutures"
 KEY_PROTOCOL = f"{STREAM_PROTOCOL}.bearer."

@@ -22,8 +22,8 @@ from jaxtyping import Float
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
-from service import messages
-from service.exchange import (
+from service.asking import messages
+from service.asking.exchange import (
     BACK_OFF_S,
     BusyError,
     ClientError,
@@ -32,8 +32,8 @@ from service.exchange import (
     key,
     problem_error,
 )
+from service.asking.messages import LivePrediction, PredictOptions
 from service.media import MSGPACK, decoded, encoded
-from service.messages import LivePrediction, PredictOptions
 
 KEPT_FRAMES = 256
 CLOSING_S = 1.0

@@ -8,18 +8,18 @@ from typing import Any
 
 from models.bundle import Manifest
 from service import schemas
-from service.actions import action_indices, max_frames
-from service.answer import Answer
+from service.answers.answer import Answer
+from service.answers.occupancy import Query
+from service.answers.quantiles import check_levels
 from service.catalog import Catalog
 from service.engine import trajectory
 from service.errors import FieldError, PosesError
 from service.futures import num_frames
 from service.media import STREAMS
 from service.observation import Observation, read_observation
-from service.occupancy import Query
-from service.quantiles import check_levels
+from service.poses.actions import action_indices, max_frames
+from service.poses.skeletons import requested_skeleton
 from service.settings import Settings
-from service.skeletons import requested_skeleton
 from service.worker import Worker
 
 MANY_FRAMES = 200  # some milliseconds of reading, which the event loop has not got

@@ -13,9 +13,9 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from service.errors import FieldError, MethodError, NotFoundError, ServiceError
-from service.poses import shown
+from service.http.visits import CLIENT_GONE, ID_HEADER
+from service.poses.arrays import shown
 from service.schemas import Problem
-from service.visits import CLIENT_GONE, ID_HEADER
 
 MEDIA_TYPE = "application/problem+json"
 

@@ -10,7 +10,7 @@ from starlette.types import Scope
 PATH = "/"
 FILES_PATH = "/viewer"
 
-_FOLDER = Path(__file__).parent / "viewer"
+_FOLDER = Path(__file__).parents[1] / "viewer"
 _HEADERS = {
     # No other host and no inline script; MediaPipe compiles WebAssembly.
     "Content-Security-Policy": "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; "

@@ -30,15 +30,15 @@ from service.errors import (
     ServiceError,
     UnavailableError,
 )
-from service.guard import STREAM_PROTOCOL
+from service.http.guard import STREAM_PROTOCOL
+from service.http.plans import Plan, deadline_of, planned, prepared, seed_of
+from service.http.problems import content_of, field_error, problem
+from service.live.sessions import Frame, Session, Watch
 from service.media import JSON, MSGPACK, decoded, encoded
 from service.observation import frames_needed
-from service.plans import Plan, deadline_of, planned, prepared, seed_of
-from service.poses import confidence_array, poses_array, shown
-from service.problems import content_of, field_error, problem
+from service.poses.arrays import confidence_array, poses_array, shown
+from service.poses.skeletons import requested_skeleton, sent_joints
 from service.schemas import PredictRequest, StreamFrame, StreamStart
-from service.sessions import Frame, Session, Watch
-from service.skeletons import requested_skeleton, sent_joints
 
 MAX_MESSAGE_BYTES = 2**16
 RESTARTING, TAKEN = 1012, 4409  # why the server closes a connection

@@ -12,8 +12,8 @@ from starlette.types import ASGIApp, Message
 
 from service.catalog import Catalog
 from service.example import EXAMPLE
+from service.http.visits import OWN, Visit
 from service.media import JSON
-from service.visits import OWN, Visit
 
 
 async def warm_up(app: ASGIApp, catalog: Catalog) -> None:

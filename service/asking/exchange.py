@@ -21,8 +21,8 @@ from urllib.parse import quote
 import httpx
 import orjson
 
+from service.asking.messages import Call
 from service.media import MSGPACK, NDJSON, decoded, encoded
-from service.messages import Call
 
 BACK_OFF_S = 0.1  # at most, before the second try; doubled for each that follows
 

@@ -9,9 +9,9 @@ from typing import Any, Generic, Literal, TypedDict, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from service.modes import Mode
-from service.occupancy import Occupancy
-from service.quantiles import Regions
+from service.answers.modes import Mode
+from service.answers.occupancy import Occupancy
+from service.answers.quantiles import Regions
 from service.schemas import MAX_SEED
 
 _T = TypeVar("_T")

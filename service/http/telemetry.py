@@ -11,7 +11,7 @@ from fastapi.telemetry import TelemetryConfig
 from opentelemetry import trace
 
 from service.errors import ServiceError
-from service.guard import OPEN_PATHS
+from service.http.guard import OPEN_PATHS
 
 _EXPORTER = "opentelemetry.exporter.otlp.proto.http"
 

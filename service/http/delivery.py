@@ -16,8 +16,8 @@ from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from service.errors import ServiceError
+from service.http.problems import content_of
 from service.media import EVENT_STREAM
-from service.problems import content_of
 
 KEEP_ALIVE_S = 15.0
 

@@ -10,9 +10,6 @@ from models.motion.axes import Axes
 from models.motion.guesses import body_of
 from models.motion.skeleton import BODY21, Skeleton, joint_map
 from service import schemas
-from service.body import BodyRoute
-from service.checks import findings, whole
-from service.dependencies import TheCatalog
 from service.errors import (
     BodyTooLargeError,
     FieldError,
@@ -24,10 +21,13 @@ from service.errors import (
     UnauthorisedError,
     UnavailableError,
 )
+from service.http.body import BodyRoute
+from service.http.checks import findings, whole
+from service.http.dependencies import TheCatalog
+from service.http.problems import content_of, declared
 from service.observation import Seen, body_weights, caller_rate, observe, read_seen, sources
-from service.problems import content_of, declared
-from service.skeletons import requested_skeleton
-from service.stance import guessed_axes
+from service.poses.skeletons import requested_skeleton
+from service.poses.stance import guessed_axes
 
 router = APIRouter(route_class=BodyRoute, responses=declared(UnauthorisedError))
 

@@ -5,11 +5,11 @@ from collections.abc import AsyncIterator
 from dataclasses import asdict
 
 from models.motion.motion import Motion
+from service.asking.exchange import BadRequestError
+from service.asking.live import AsyncLive
+from service.asking.messages import LivePrediction
 from service.errors import TooFewFramesError
-from service.exchange import BadRequestError
-from service.live_client import AsyncLive
 from service.media import JSON, encoded
-from service.messages import LivePrediction
 
 
 async def replayed(

@@ -6,7 +6,7 @@ from logging.config import dictConfig
 
 import orjson
 
-from service.visits import request_id
+from service.http.visits import request_id
 
 
 class JsonFormatter(logging.Formatter):
