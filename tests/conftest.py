@@ -5,8 +5,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from in_memory import Service
 from tiny_bundles import X_T_SHAPE, write_actions_bundle, write_diffusion_bundle, write_still_bundle
+
+settings.register_profile("untimed", deadline=None)  # machines are noisy
+settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session")

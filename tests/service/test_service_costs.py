@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from service.engine.costs import Costs
@@ -63,7 +63,6 @@ def test_clock_is_read_around_a_call_and_not_where_it_fails():
     assert costs.expected(step=5) == pytest.approx(0.5)
 
 
-@settings(deadline=None)
 @given(
     calls=st.lists(st.tuples(st.integers(1, 500), st.floats(0.0, 60.0)), min_size=1),
     rows=st.integers(1, 1000),

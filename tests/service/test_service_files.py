@@ -135,7 +135,7 @@ def test_packed_file_may_not_grow_beyond_the_limit(service: Service):
         assert (problem.status_code, problem.json()["type"]) == (413, "/problems/body-too-large")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(body=st.binary(max_size=300), suffix=st.sampled_from([".bvh", ".npz", ".zip", ".amc", ""]))
 def test_any_bytes_are_read_or_refused(service: Service, body: bytes, suffix: str):
     assert sent(service, body, name=f"x{suffix}").status_code == 422

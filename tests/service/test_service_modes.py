@@ -27,7 +27,7 @@ futures_of_some_kinds = st.builds(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(futures=futures_of_some_kinds, num_modes=st.integers(1, 16))
 def test_modes_share_out_all_futures_and_no_swap_is_better(futures: np.ndarray, num_modes: int):
     found = modes(futures, num_modes=num_modes)
@@ -53,7 +53,7 @@ def test_modes_share_out_all_futures_and_no_swap_is_better(futures: np.ndarray, 
             assert cost(distances, swapped) >= best
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(futures=futures_of_some_kinds, num_modes=st.integers(1, 6))
 def test_modes_are_the_same_again_and_wherever_the_world_begins(futures, num_modes):
     found = modes(futures, num_modes=num_modes)
@@ -61,7 +61,7 @@ def test_modes_are_the_same_again_and_wherever_the_world_begins(futures, num_mod
     assert modes(futures + np.float32(2**-3), num_modes=num_modes) == found
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(futures=futures_of_some_kinds)
 def test_as_many_modes_as_futures_are_the_futures(futures: np.ndarray):
     count = len(futures)

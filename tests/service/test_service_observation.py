@@ -15,7 +15,7 @@ from service.futures import caller_futures
 from service.observation import Observation, frames_needed, read_observation
 from service.poses.skeletons import OwnJoints
 
-SAME_BUNDLE = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+SAME_BUNDLE = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture(scope="module")

@@ -72,7 +72,6 @@ def test_a_box_is_turned_about_up():
     assert distance(along(3, 0, 0), along(3, 0, 0), eighth) == pytest.approx(3 - 2**0.5)
 
 
-@settings(deadline=None)
 @given(points, points, regions)
 def test_no_point_of_a_bone_is_nearer_and_one_is_as_near(start, end, region):
     """The slow obvious way: very many points of the line."""
@@ -85,7 +84,6 @@ def test_no_point_of_a_bone_is_nearer_and_one_is_as_near(start, end, region):
     assert found >= sampled.min() - spacing - 1e-6
 
 
-@settings(deadline=None)
 @given(points, points, boxes, points, st.floats(-pi, pi))
 def test_distance_does_not_change_when_the_world_is_turned_and_moved(start, end, box, shift, yaw):
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -96,20 +94,17 @@ def test_distance_does_not_change_when_the_world_is_turned_and_moved(start, end,
     )
 
 
-@settings(deadline=None)
 @given(points, points, regions)
 def test_distance_does_not_depend_on_the_direction_of_a_bone(start, end, region):
     assert distance(start, end, region) == pytest.approx(distance(end, start, region), abs=1e-6)
 
 
-@settings(deadline=None)
 @given(points, points, points, regions)
 def test_distance_changes_by_no_more_than_the_bone_moves(start, end, shift, region):
     moved = distance(start + shift, end + shift, region)
     assert abs(moved - distance(start, end, region)) <= np.linalg.norm(shift) + 1e-6
 
 
-@settings(deadline=None)
 @given(points, points, capsules)
 def test_a_thicker_capsule_is_nearer_by_as_much(start, end, capsule):
     thicker = Capsule(start=capsule.start, end=capsule.end, radius=capsule.radius + 0.5)
@@ -119,7 +114,6 @@ def test_a_thicker_capsule_is_nearer_by_as_much(start, end, capsule):
     )
 
 
-@settings(deadline=None)
 @given(points, points, points, points)
 def test_a_bone_and_a_line_are_as_far_apart_either_way(start, end, other_start, other_end):
     def to(a: np.ndarray, b: np.ndarray) -> Capsule:
@@ -138,7 +132,7 @@ def test_a_body_is_as_near_as_its_nearest_bone_in_each_frame():
     np.testing.assert_allclose(apart, [1.25**0.5 - 0.1, 3.9])
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32), regions)
 def test_a_body_is_as_near_as_the_nearest_of_all_its_bones(seed, region):
     """The slow obvious way: every bone is measured."""
@@ -174,7 +168,6 @@ def test_futures_that_have_ended_tell_nothing_of_what_comes_after():
     assert found.never == 0.0
 
 
-@settings(deadline=None)
 @given(st.lists(st.lists(st.floats(0.0, 3.0), min_size=1, max_size=5), min_size=1, max_size=6))
 def test_a_wider_margin_is_entered_sooner_and_more_often(distances):
     samples = [np.array(sample) for sample in distances]

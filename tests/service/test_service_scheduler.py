@@ -162,7 +162,7 @@ def test_a_step_has_at_least_one_row():
         Scheduler(rows_per_step=0)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     requests=st.lists(
         st.tuples(st.integers(1, 60), st.integers(1, 6), st.floats(0.0, 99.0)),
@@ -196,7 +196,7 @@ def test_every_turn_is_full_and_bounded_and_no_request_starves(requests, rows_pe
     assert sum(run.values()) == len(run) == work
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(shorter=st.integers(1, 9), others=st.integers(1, 8), rows_per_step=st.integers(2, 64))
 def test_one_row_never_waits_longer_for_more_rows_of_others(shorter, others, rows_per_step):
     scheduler = scheduler_of(*[(50, 10)] * others, rows_per_step=rows_per_step)

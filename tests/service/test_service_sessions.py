@@ -2,7 +2,7 @@ from asyncio import Event
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from models.motion.axes import Axes
@@ -30,7 +30,6 @@ def filled(times: list[float]) -> History:
 spacings = st.lists(st.floats(1e-4, 0.9 * GAP_S), min_size=1, max_size=200)
 
 
-@settings(deadline=None)
 @given(spacings, st.floats(-100.0, 100.0))
 def test_it_suffices_when_what_is_kept_spans_what_a_request_needs(gaps: list[float], start: float):
     times = start + np.cumsum(gaps)
@@ -41,7 +40,6 @@ def test_it_suffices_when_what_is_kept_spans_what_a_request_needs(gaps: list[flo
     assert kept[0] <= seen[0]
 
 
-@settings(deadline=None)
 @given(spacings)
 def test_so_many_frames_are_kept_and_no_more(gaps: list[float]):
     history = filled(np.cumsum(gaps).tolist())

@@ -581,6 +581,4 @@ def test_each_request_is_answered_once_and_no_slot_leaks(runner: HeldRunner):
         pass
 
     Machine.runner = runner
-    run_state_machine_as_test(
-        Machine, settings=settings(max_examples=25, stateful_step_count=20, deadline=None)
-    )
+    run_state_machine_as_test(Machine, settings=settings(max_examples=25, stateful_step_count=20))

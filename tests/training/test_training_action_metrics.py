@@ -38,7 +38,7 @@ def by_hand(first: np.ndarray, second: np.ndarray) -> set[float]:
     return {total / count for count in counts}
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 1000))
 def test_warping_is_that_of_a_search_one_by_one(first: int, second: int, seed: int):
     generator = np.random.default_rng(seed)

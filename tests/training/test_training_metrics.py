@@ -70,7 +70,7 @@ def test_ade_and_fde_choose_their_own_best_sample():
     assert fde(samples, future)[0] == 1.0
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(2, 8), st.integers(0, 1000))
 def test_more_samples_never_raise_the_error_and_order_never_matters(count: int, seed: int):
     samples, future = random_poses(2, count, 3, seed=seed), random_poses(2, 3, seed=seed + 1)

@@ -1,5 +1,5 @@
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from models.motion.gaps import at_even_times, num_even
@@ -12,7 +12,6 @@ def pose(t: float) -> np.ndarray:
     return np.array([[t, 2.0 * t, 1.0], [-30.0 * t, 0.0, 2.0 + t]])
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(1e-4, 0.4), min_size=1, max_size=50), st.floats(-100.0, 100.0))
 def test_even_motion_is_even_however_uneven_its_frames_are(gaps: list[float], start: float):
     times = start + np.cumsum([0.0, *gaps])

@@ -68,7 +68,7 @@ def test_forward_kinematics_is_the_product_of_matrices_down_the_tree():
                 np.testing.assert_allclose(positions[t, j], expected, atol=1e-12)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seeds)
 def test_rotations_found_from_rigid_positions_give_them_back(seed):
     _, positions = rigid_motion(seed)

@@ -113,7 +113,7 @@ def content(tmp_path_factory) -> bytes:
     return path.read_bytes()
 
 
-@settings(max_examples=200, deadline=None,
+@settings(max_examples=200,
           suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
 @given(st.data())
 def test_garbage_is_read_or_refused_but_never_breaks_the_reader(tmp_path, content, data):

@@ -152,7 +152,7 @@ def test_a_damaged_asf_is_refused_with_the_place(tmp_path, asf, error, message):
         read(tmp_path, asf=asf)
 
 
-@settings(max_examples=300, deadline=None,
+@settings(max_examples=300,
           suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
 @given(st.data())
 def test_garbage_is_read_or_refused_but_never_breaks_the_reader(tmp_path, data):

@@ -170,7 +170,7 @@ def test_a_damaged_file_is_refused_with_the_place(tmp_path, text, error, message
         read_bvh(write(tmp_path, text))
 
 
-@settings(max_examples=300, deadline=None,
+@settings(max_examples=300,
           suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
 @given(st.data())
 def test_garbage_is_read_or_refused_but_never_breaks_the_reader(tmp_path, data):

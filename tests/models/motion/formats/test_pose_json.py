@@ -195,7 +195,7 @@ JSON = st.recursive(
 )  # fmt: skip
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=JSON, inside=st.sampled_from(["skeleton", "axes", "fps", "timestamps", None]))
 def test_any_json_is_read_or_refused(tmp_path: Path, content: Any, inside: str | None):
     whole = content if inside is None else {"poses": POSES, inside: content}
