@@ -189,6 +189,8 @@ class Worker:
 
     async def drain(self, within_s: float) -> None:
         """Take no more; after this time let what is under way end with what it has; then stop."""
+        with self._changed:
+            self._closed = True
         await asyncio.to_thread(self._drain, within_s)
 
     def stop(self) -> None:
@@ -202,7 +204,6 @@ class Worker:
 
     def _drain(self, within_s: float) -> None:
         with self._changed:
-            self._closed = True
             self._changed.wait_for(self._is_idle, timeout=within_s)
             self._engine.hurry()
             self._changed.wait_for(self._is_idle)

@@ -36,6 +36,7 @@ from training.cli import load_recipe
 
 RECIPE = "models.systems.belfusion.recipes:h36m"
 BUNDLES = ROOT / "models/bundles"
+BUNDLE = "belfusion"
 
 HOW = f"""\
 N = {NUM_SAMPLES} futures, all 10 steps where nothing else is said. The baseline is our recipe
@@ -66,7 +67,7 @@ def main(
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
     torch.set_num_threads(cores)
     found, peak_mb, start_s = measured(rounds, singles=singles, seconds=seconds)
-    manifest = read_manifest(BUNDLES / (BUNDLES / "DEFAULT").read_text().split()[0])
+    manifest = read_manifest(BUNDLES / BUNDLE)
     rows = table(found, peak_mb=peak_mb, start_s=start_s)
     performed = actions.table(BUNDLES / "wat", rounds=1 if quick else 7, cores=cores)
     machine = f"{cores} cores of {processor()}, {datetime.now(UTC):%Y-%m-%d}"
@@ -103,8 +104,8 @@ def measured(rounds: int, *, singles: int, seconds: float) -> tuple[list[Figures
     with ExitStack() as stack:
         bench = Bench(
             paper=paper_sized(load_recipe(RECIPE), num_samples=NUM_SAMPLES),
-            latency=stack.enter_context(serving(profile="latency")),
-            throughput=(server := stack.enter_context(serving())),
+            latency=stack.enter_context(serving(default_model=BUNDLE, profile="latency")),
+            throughput=(server := stack.enter_context(serving(default_model=BUNDLE))),
             loader=stack.enter_context(
                 ProcessPoolExecutor(1, mp_context=context, initializer=be_nice)
             ),

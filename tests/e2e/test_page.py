@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 from browsing import (
@@ -67,6 +68,7 @@ def page(opened: "sync_api.Page", complaints: list[str]) -> "sync_api.Page":
     opened.locator("label", has=opened.locator("#ask-predict")).click()
     slide(opened, "#seed", 7)
     slide(opened, "#num-samples", 20)
+    slide(opened, "#num-steps", usual_steps(opened))
     opened.select_option("#sample", "all")
     opened.click("[data-demo=hello]")
     expect(opened.locator("#motion-text")).to_contain_text("hello")
@@ -74,6 +76,11 @@ def page(opened: "sync_api.Page", complaints: list[str]) -> "sync_api.Page":
     expect(opened.locator("#motion-text")).to_contain_text("stroll")
     opened.locator('#timing[data-futures="20"][data-seed="7"]').wait_for()
     return opened
+
+
+def usual_steps(page: "sync_api.Page") -> int:
+    """The denoising steps that the model runs unless it is told another number."""
+    return int(page.locator("#num-steps").get_attribute("data-usual"))
 
 
 def seek(page: "sync_api.Page", seconds: float) -> None:
@@ -198,7 +205,21 @@ def drop(page: "sync_api.Page", file: Path) -> None:
     page.dispatch_event("#stage", "drop", {"dataTransfer": transfer})
 
 
+def test_the_steps_are_the_model_s_own_until_the_slider_says_others(page, server):
+    models = httpx.get(f"{server.url}/models").json()["models"]
+    answering = next(model for model in models if not model["actions"])
+    assert usual_steps(page) == answering["default_steps"] < answering["num_steps"]
+    assert int(page.locator("#num-steps").get_attribute("max")) == answering["num_steps"]
+    for steps, asked in ((usual_steps(page), None), (1, 1), (answering["num_steps"],) * 2):
+        with page.expect_request("**/predict") as sent:
+            slide(page, "#num-steps", steps)
+            slide(page, "#seed", 40 + steps)
+            page.locator(f'#timing[data-seed="{40 + steps}"]').wait_for()
+        assert sent.value.post_data_json.get("num_steps") == asked
+
+
 def test_the_denoiser_is_watched_step_by_step(page):
+    slide(page, "#num-steps", 10)
     page.click("#denoise")
     page.locator('#preview[data-step="9"]').wait_for(state="attached")
     expect(page.locator("#preview")).to_be_hidden()  # then the answer is there

@@ -26,11 +26,12 @@ export function adaptTo(model: Model): void {
   }
   input("num-samples").value = numSamples[kind()];
   const steps = input("num-steps");
-  const most = model?.num_steps ?? 0;
-  const all = steps.value === steps.max;
+  const most = Math.max(model?.num_steps ?? 1, 1);
+  const wasUsual = steps.value === (steps.dataset.usual ?? steps.value);
   steps.disabled = button("denoise").disabled = most < 2;
-  steps.max = String(Math.max(most, 1));
-  if (all || Number(steps.value) > most) steps.value = steps.max;
+  steps.max = String(most);
+  steps.dataset.usual = String(model?.default_steps ?? most);
+  if (wasUsual || Number(steps.value) > most) steps.value = steps.dataset.usual;
   showSliders();
 }
 
@@ -66,7 +67,7 @@ function ofPredictions(numSamples: number): Partial<PredictRequest> {
   return {
     return: returned,
     num_modes: Number(input("num-modes").value),
-    ...(steps.disabled || steps.value === steps.max ? {} : { num_steps: Number(steps.value) }),
+    ...(steps.value === steps.dataset.usual ? {} : { num_steps: Number(steps.value) }),
   };
 }
 
