@@ -180,6 +180,8 @@ def test_a_dropped_bvh_is_predicted_in_its_own_skeleton(page, tmp_path, complain
     write_bvh(tmp_path / "mine.bvh", motion)
     drop(page, tmp_path / "mine.bvh")
     expect(page.locator("#motion-text")).to_contain_text("mine: 1.5 s")
+    slide(page, "#seed", 23)
+    page.locator('#timing[data-seed="23"]').wait_for()
     seek(page, 0.7)
     assert coloured(picture(page)) > 200
     assert complaints == []

@@ -79,13 +79,6 @@ def test_what_no_path_answers_in_is_refused(service: Service, accept: str):
     assert "application/x-npz" in response.json()["expected"]
 
 
-def test_streams_are_not_for_actions(performing_service: Service):
-    body = dumped({"poses": WALK, "actions": ["wave"]})
-    response = posted(performing_service, body, "application/json", accept="text/event-stream",
-                      path="/predict_actions")  # fmt: skip
-    assert response.status_code == 406
-
-
 def test_every_media_type_says_the_same(service: Service):
     ways = {
         "application/json": dumped({"poses": WALK} | FIELDS),
