@@ -27,9 +27,6 @@ from service.routes import health, router
 from service.settings import Settings
 from service.worker import Worker
 
-NICENESS = 10
-"""How much nicer the threads that compute are than the event loop, which waits for no slice."""
-
 KEY_OF_STREAMS = (
     "In browsers, which cannot set this header for WS /stream, the WebSocket offers the protocols "
     f"`{STREAM_PROTOCOL}` and `{KEY_PROTOCOL}` before the key in base64url without padding."
@@ -129,7 +126,8 @@ def _load(
         once_ready()
 
     if sys.platform == "linux":  # elsewhere the whole process has one
-        os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
+        nicer = os.getpriority(os.PRIO_PROCESS, 0) + app.state.settings.niceness
+        os.setpriority(os.PRIO_PROCESS, 0, nicer)
     catalog.load(warmed_up)
 
 

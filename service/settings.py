@@ -36,6 +36,13 @@ class Settings(BaseSettings):
     threads: int | None = Field(
         default=None, ge=1, description="cores of one graph's call; by default the profile's"
     )
+    niceness: int = Field(
+        default=10,
+        ge=0,
+        le=19,
+        description="of the threads that compute: beside the event loop, so that it answers at "
+        "once, and beside other programs; Linux only",
+    )
     rows_per_step: int = Field(default=ROWS_PER_STEP, ge=1, description="of one worker's step")
     max_queued_requests: int = Field(default=64, ge=1, description="under way")
     max_queued_rows: int = Field(

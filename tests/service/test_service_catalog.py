@@ -21,7 +21,7 @@ from tiny_bundles import (
 )
 
 from models.bundle import read_manifest
-from service.app import NICENESS, create_app
+from service.app import create_app
 from service.catalog import Catalog
 from service.engine.engine import Engine
 from service.errors import UnknownModelError
@@ -197,14 +197,14 @@ def test_server_without_bundles_is_alive_and_not_ready(tmp_path: Path, folder: s
 @pytest.mark.skipif(sys.platform != "linux", reason="threads have no priority of their own")
 def test_threads_that_compute_leave_the_cores_to_the_event_loop(bundles: Path):
     before = set(threading.enumerate())
-    with Service.of(bundles, workers=2) as service:
+    with Service.of(bundles, workers=2, niceness=3) as service:
         service.wait_until_loaded()
         others = set(threading.enumerate()) - before
         computing = [thread for thread in others if thread.name.startswith("engine-")]
         priorities = {os.getpriority(os.PRIO_PROCESS, t.native_id or 0) for t in computing}
         own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     assert len(computing) == 4
-    assert priorities == {own + NICENESS}
+    assert priorities == {own + 3}
 
 
 def test_only_loading_makes_a_server_unready(bundles: Path, monkeypatch: pytest.MonkeyPatch):
