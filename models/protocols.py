@@ -1,6 +1,7 @@
 """What recipes learn from: our public motion capture, and the windows of the field's benchmarks."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from models.motion.skeleton import BODY21, H36M17, SMPL22
 from models.system import Augmentation, Data
@@ -35,11 +36,8 @@ def mocap_data(
         shares: of the windows by source; those of `EVERYTHING` by default.
         hold_out: selectors of clips that must not be learnt from.
     """
-    return Data(
-        skeleton=BODY21,
-        fps=30.0,
-        num_observed=15,
-        horizon=60,
+    return replace(
+        TWO_SECONDS,
         shares=shares or EVERYTHING,
         hold_out=hold_out,
         augmentation=Augmentation(

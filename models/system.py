@@ -139,6 +139,14 @@ def stepwise(progress: float, *, factor: float, steps: int, flat: int = 0) -> fl
     return factor ** max(0, int(progress * steps) - flat)
 
 
+def goes_on(name: str, recipe: Recipe, *, num_updates: int, learning_rate: float) -> Recipe:
+    """The last stage of a recipe alone, for a run that goes on from a finished one, unprepared."""
+    last = dataclasses.replace(
+        recipe.stages[-1], prepare=None, num_updates=num_updates, learning_rate=learning_rate
+    )
+    return dataclasses.replace(recipe, name=name, stages=(last,))
+
+
 def describe(value: Any) -> Any:
     """A recipe, or any part of it, as JSON: functions by dotted name, with their arguments."""
     if isinstance(value, functools.partial):

@@ -29,7 +29,7 @@ from service.errors import PosesError, TooFewFramesError, UnknownSkeletonError
 from service.poses.arrays import confidence_array, poses_array, times_array
 from service.poses.person import check_person
 from service.poses.skeletons import OwnJoints, own_skeleton, sent_order
-from service.poses.stance import Finding, stance
+from service.poses.stance import Finding, guessed_axes, stance
 
 Source = Literal["observed", "derived", "imputed"]
 
@@ -170,7 +170,7 @@ def observe(seen: Seen, *, axes: Axes, fps: float, manifest: Manifest) -> Observ
     is_seen = np.isfinite(window[0, :, 0])
     weights, guessed = body_weights(skeleton, is_seen, target)
     body = body_of(window[:, is_seen], without_joints(skeleton, is_seen))
-    odd = [_warning(finding) for finding in stance(body, axes)]
+    odd = [_warning(finding) for finding in stance(body, axes, guessed_axes(body, axes))]
     root = np.matmul(weights[0], window[-1, is_seen])
     lowest = float(window[-1, is_seen, 2].min())
     offset = np.array([root[0], root[1], lowest if abs(lowest) > MAX_HEIGHT_M else 0.0])

@@ -36,7 +36,7 @@ def body_of(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> Body:
 
 def guess_up(body: Body) -> Up:
     """The axis along which the upper arms are above the feet, most of the time; by `UPRIGHT`."""
-    upwards = _middle(body, "upper_arm") - _middle(body, "foot")
+    upwards = middle(body, "upper_arm") - middle(body, "foot")
     mean = np.median(upwards, axis=0)
     axis = int(np.abs(mean).argmax())
     return _UPS[axis][int(mean[axis] < 0)]
@@ -67,5 +67,6 @@ def plausible_factor(leg: float, factors: Iterable[float]) -> float:
     return next(fitting, nearest)
 
 
-def _middle(body: Body, part: str) -> Float[np.ndarray, "T 3"]:
+def middle(body: Body, part: str) -> Float[np.ndarray, "T 3"]:
+    """Half way between the left and the right one of a part, such as ``foot``."""
     return np.asarray((body[f"left_{part}"] + body[f"right_{part}"]) / 2.0)

@@ -1,17 +1,16 @@
 """What is odd about an observation, each thing in one plain sentence."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from models.motion.axes import Axes
 from models.motion.gaps import filled
-from models.motion.guesses import Body, body_of
+from models.motion.guesses import Body, body_of, middle
 from models.motion.trees import without_joints
 from service.observation import Seen, sources
-from service.poses.stance import Finding, guessed_axes, stance, turned
+from service.poses.stance import Finding, stance, turned
 
 LIMBS = tuple(
     (f"{side}_{upper}", f"{side}_{lower}")
@@ -28,21 +27,26 @@ MAX_SPEED_M_S = 12.0  # of the hips: what the fastest sprinter reaches
 STILL_M = 1e-6
 
 
-def whole(seen: Seen) -> Seen:
-    """The joints that were ever seen, without gaps in time."""
+def whole_body(seen: Seen) -> Body:
+    """The body that the joints which were ever seen tell of, without gaps in time."""
     ever = np.isfinite(seen.world[:, :, 0]).any(axis=0)
     tree = without_joints(seen.skeleton, ever)
     times = np.arange(len(seen.world), dtype=float) if seen.times is None else seen.times
-    world = filled(seen.world[:, ever], times, tree.parents)
-    return replace(seen, world=world, skeleton=tree)
+    return body_of(filled(seen.world[:, ever], times, tree.parents), tree)
 
 
-def findings(seen: Seen, axes: Axes, fps: float) -> list[Finding]:
-    """All that is odd; beyond the axes, as if those were what the poses look like."""
-    filled_in = whole(seen)
-    body = body_of(filled_in.world, filled_in.skeleton)
-    found = [*stance(body, axes), *_joints(seen), *_frozen(seen)]
-    upright = turned(body, axes, guessed_axes(body, axes))
+def findings(seen: Seen, body: Body, *, axes: Axes, looks: Axes, fps: float) -> list[Finding]:
+    """All that is odd; beyond the axes, as if those were what the poses look like.
+
+    Args:
+        seen: as it was sent.
+        body: what `whole_body` makes of it.
+        axes: that it is said to be in.
+        looks: those that the body looks like.
+        fps: of the frames, where they have no times.
+    """
+    found = [*stance(body, axes, looks), *_joints(seen), *_frozen(seen)]
+    upright = turned(body, axes, looks)
     times = np.arange(len(seen.world)) / fps if seen.times is None else seen.times
     return [*found, *_limbs(upright), *_teleport(upright, times), *_path(upright)]
 
@@ -90,7 +94,7 @@ def _limbs(body: Body) -> Iterator[Finding]:
 
 
 def _teleport(body: Body, times: Float[np.ndarray, "T"]) -> Iterator[Finding]:
-    steps = np.linalg.norm(np.diff(_pelvis(body), axis=0), axis=-1)
+    steps = np.linalg.norm(np.diff(middle(body, "upper_leg"), axis=0), axis=-1)
     speeds = steps / np.diff(times)
     if len(speeds) and speeds.max() > MAX_SPEED_M_S:
         frame = int(np.argmax(speeds))
@@ -102,7 +106,7 @@ def _teleport(body: Body, times: Float[np.ndarray, "T"]) -> Iterator[Finding]:
 
 
 def _path(body: Body) -> Iterator[Finding]:
-    moved = np.max(np.ptp(_pelvis(body), axis=0))
+    moved = np.max(np.ptp(middle(body, "upper_leg"), axis=0))
     stepped = np.max(np.ptp(body["left_foot"], axis=0))
     if moved < 1e-3 and stepped > 0.1:
         yield Finding(
@@ -110,7 +114,3 @@ def _path(body: Body) -> Iterator[Finding]:
             sentence="The hips never leave their place while the feet move: the path of the "
             "person is missing, so futures stay in place too.",
         )
-
-
-def _pelvis(body: Body) -> Float[np.ndarray, "T 3"]:
-    return np.asarray((body["left_upper_leg"] + body["right_upper_leg"]) / 2.0)

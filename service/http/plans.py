@@ -27,12 +27,16 @@ MANY_FRAMES = 200  # some milliseconds of reading, which the event loop has not 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Plan:
-    """Who answers a request, with how many frames (None leaves that to the bundle) and poses."""
+    """Who answers a request, and what it asks that does not depend on its poses.
+
+    A ``horizon`` of None leaves the number of frames to the bundle.
+    """
 
     manifest: Manifest
     worker: Worker
     horizon: int | None
     most_poses: int
+    query: Query | None
 
 
 def planned(body: schemas.PredictRequest, *, catalog: Catalog, settings: Settings) -> Plan:
@@ -41,7 +45,7 @@ def planned(body: schemas.PredictRequest, *, catalog: Catalog, settings: Setting
     Raises:
         ServiceError: it cannot be, whatever its poses are.
     """
-    _query(body, body.returned)
+    query = _query(body, body.returned)
     manifest, worker = catalog.ready(body.model, with_actions=False)
     horizon = _horizon(body, settings, manifest)
     _check_limits(body, settings)
@@ -49,7 +53,13 @@ def planned(body: schemas.PredictRequest, *, catalog: Catalog, settings: Setting
         check_levels(
             body.quantile_levels, num_samples=body.num_samples, calibration=manifest.calibration
         )
-    return Plan(manifest=manifest, worker=worker, horizon=horizon, most_poses=settings.max_poses)
+    return Plan(
+        manifest=manifest,
+        worker=worker,
+        horizon=horizon,
+        most_poses=settings.max_poses,
+        query=query,
+    )
 
 
 async def prepared(
@@ -91,7 +101,7 @@ async def prepared(
         returned=body.returned,
         num_modes=body.num_modes,
         levels=body.quantile_levels,
-        query=_query(body, body.returned),
+        query=plan.query,
         beside=beside or {},
     )
     return request, answer

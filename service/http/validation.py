@@ -7,7 +7,6 @@ from fastapi import APIRouter
 
 from models.bundle import Manifest
 from models.motion.axes import Axes
-from models.motion.guesses import body_of
 from models.motion.skeleton import BODY21, Skeleton, joint_map
 from service import schemas
 from service.errors import (
@@ -22,7 +21,7 @@ from service.errors import (
     UnavailableError,
 )
 from service.http.body import BodyRoute
-from service.http.checks import findings, whole
+from service.http.checks import findings, whole_body
 from service.http.dependencies import TheCatalog
 from service.http.problems import content_of, declared
 from service.observation import Seen, body_weights, caller_rate, observe, read_seen, sources
@@ -90,8 +89,8 @@ def _check_body(seen: Seen) -> None:
 def _told(seen: Seen, axes: Axes, fps: float) -> schemas.Validation:
     place = {index: i for i, index in enumerate(seen.order)}
     given = sources(seen)
-    filled_in = whole(seen)
-    looks = guessed_axes(body_of(filled_in.world, filled_in.skeleton), axes)
+    body = whole_body(seen)
+    looks = guessed_axes(body, axes)
     mapped, estimated, guessed = _resolved(seen.skeleton)
     return schemas.Validation(
         predicts=True,
@@ -106,7 +105,7 @@ def _told(seen: Seen, axes: Axes, fps: float) -> schemas.Validation:
         fps=fps,
         findings=[
             schemas.ValidationFinding(about=found.about, sentence=found.sentence)
-            for found in findings(seen, axes, fps)
+            for found in findings(seen, body, axes=axes, looks=looks, fps=fps)
         ],
         warnings=[],
     )

@@ -20,9 +20,8 @@ class Finding:
     sentence: str
 
 
-def stance(body: Body, axes: Axes) -> list[Finding]:
-    """What is odd about a body in metres, +Z up, if the axes are those that it came in."""
-    looks = guessed_axes(body, axes)
+def stance(body: Body, axes: Axes, looks: Axes) -> list[Finding]:
+    """What is odd about a body in metres, +Z up, that came in axes and looks like others."""
     upright = turned(body, axes, looks)
     return [*_units(body, axes, looks), *_up(axes, looks), *_sides(upright)]
 

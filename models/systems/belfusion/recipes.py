@@ -7,7 +7,7 @@ from models.continuation import Continuation
 from models.diffusion import sqrt_schedule
 from models.pose import RootRelativePoses, WorldPoses
 from models.protocols import AMASS, H36M, HELD_OUT, TWO_SECONDS, mocap_data
-from models.system import Data, Recipe, Stage, stepwise
+from models.system import Data, Recipe, Stage, goes_on, stepwise
 from models.systems.belfusion import objective, recurrent, spectral
 from models.systems.belfusion.dense_unet import DenseUNet
 from models.systems.belfusion.graphs import graphs
@@ -129,11 +129,7 @@ def mocap_held_out() -> Recipe:
 
 def mocap_everything() -> Recipe:
     """What ships: a finished `mocap_held_out` goes on, on every training clip, latents kept."""
-    recipe = mocap()
-    denoiser = dataclasses.replace(
-        recipe.stages[-1], prepare=None, num_updates=6_000, learning_rate=4e-4
-    )
-    return dataclasses.replace(recipe, name="mocap_everything", stages=(denoiser,))
+    return goes_on("mocap_everything", mocap(), num_updates=6_000, learning_rate=4e-4)
 
 
 def mocap_cmu() -> Recipe:

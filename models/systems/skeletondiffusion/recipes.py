@@ -10,7 +10,7 @@ from torch.nn import functional
 from models.diffusion import Schedule, cosine_schedule
 from models.motion.skeleton import BODY21
 from models.protocols import AMASS, H36M, HELD_OUT, TWO_SECONDS, mocap_data
-from models.system import Data, Recipe, Stage, stepwise
+from models.system import Data, Recipe, Stage, goes_on, stepwise
 from models.systems.skeletondiffusion import objective
 from models.systems.skeletondiffusion.graphs import graphs
 from models.systems.skeletondiffusion.networks import Decoder, Denoiser, Encoder, PastNetwork
@@ -219,19 +219,12 @@ def mocap_held_out() -> Recipe:
 
 def mocap_longer() -> Recipe:
     """A finished `mocap_held_out` goes on, latents kept: what is measured on held-out clips."""
-    return _goes_on("mocap_longer", mocap_held_out(), num_updates=5_000, learning_rate=8e-4)
+    return goes_on("mocap_longer", mocap_held_out(), num_updates=5_000, learning_rate=8e-4)
 
 
 def mocap_everything() -> Recipe:
     """What ships: a finished `mocap_longer` goes on, on every training clip, latents kept."""
-    return _goes_on("mocap_everything", mocap(), num_updates=2_000, learning_rate=4e-4)
-
-
-def _goes_on(name: str, recipe: Recipe, *, num_updates: int, learning_rate: float) -> Recipe:
-    denoiser = dataclasses.replace(
-        recipe.stages[-1], prepare=None, num_updates=num_updates, learning_rate=learning_rate
-    )
-    return dataclasses.replace(recipe, name=name, stages=(denoiser,))
+    return goes_on("mocap_everything", mocap(), num_updates=2_000, learning_rate=4e-4)
 
 
 def mocap_short() -> Recipe:
