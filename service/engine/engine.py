@@ -289,13 +289,9 @@ class Engine:
                 self._jobs[some.request_id].show(some)
                 following.append(some)
         self._scheduler.settle(taken, following)
-        touched = {some.request_id for some in advanced} & self._jobs.keys()
-        ended = [self._forget(i) for i in touched if self._jobs[i].finished]
-        shown = [
-            (self._jobs[i], step, some)
-            for i in touched & self._jobs.keys()
-            for step, some in self._jobs[i].ready()
-        ]
+        touched = [self._jobs[i] for i in {s.request_id for s in advanced} & self._jobs.keys()]
+        shown = [(job, step, some) for job in touched for step, some in job.ready()]
+        ended = [self._forget(job.request_id) for job in touched if job.finished]
         return ended, shown
 
     def _forget(self, request_id: int) -> Job:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
 from jaxtyping import Float
@@ -51,9 +52,14 @@ class Job:
             self.previews.setdefault(shown.steps_run, []).append(shown)
 
     def ready(self) -> list[tuple[int, list[Shown]]]:
-        """Steps that every row has behind it, or needs no more, and the futures of all then."""
+        """Steps that every row has behind it, or needs no more, and the futures of all then.
+
+        The row that ends last may be one of few steps, for which previews of the others have
+        waited; the last step's is the result.
+        """
         found: list[tuple[int, list[Shown]]] = []
-        for step in sorted(self.previews):
+        last = max(samples.steps_run for samples in self.samples) if self.finished else inf
+        for step in sorted(step for step in self.previews if step < last):
             whole = [
                 Shown(
                     sample_indices=samples.sample_indices,
