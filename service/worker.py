@@ -25,6 +25,8 @@ from service.errors import (
 
 _log = logging.getLogger(__name__)
 
+MAX_UNREAD_BYTES = 1 << 20
+
 Outcome: TypeAlias = Literal["finished", "failed", "cancelled", "refused"]
 
 
@@ -68,7 +70,7 @@ class Observer(Protocol):
 
 @dataclass(kw_only=True, slots=True, eq=False)
 class _Job:
-    """A request, who waits for it, and the latest of its previews that nobody has read."""
+    """A request, who waits for it, and the latest of its previews that nobody has read yet."""
 
     request: Request
     answer: Callable[[Result, Timing], bytes]
@@ -77,7 +79,7 @@ class _Job:
     arrived_s: float = field(default_factory=perf_counter)
     written_s: float = 0.0
     answered: Future[bytes] = field(default_factory=Future)
-    shown: deque[bytes] = field(default_factory=lambda: deque(maxlen=1))
+    shown: deque[bytes] = field(default_factory=deque)
     steps_shown: int = 0
     news: Callable[[], None] = lambda: None
 
@@ -147,9 +149,10 @@ class Worker:
         *,
         request_key: str | None = None,
     ) -> AsyncGenerator[bytes, None]:
-        """What ``preview`` makes of the latest preview, again and again, and at last the answer.
+        """What ``preview`` makes of each preview, and at last the answer.
 
-        Who reads slowly misses previews. Closing it frees the rows; so does a cancelled reader.
+        Who reads slowly misses previews: the latest `MAX_UNREAD_BYTES` wait. Closing it frees the
+        rows; so does a cancelled reader.
 
         Raises:
             ServiceError: as for ``predict``, what is known at once before anything is read.
@@ -303,6 +306,8 @@ class Worker:
             if preview.steps_run > job.steps_shown:  # another thread may have been faster
                 job.steps_shown = preview.steps_run
                 job.shown.append(body)
+                while len(job.shown) > 1 and sum(map(len, job.shown)) > MAX_UNREAD_BYTES:
+                    job.shown.popleft()
         job.news()
 
     def _end(self, ended: Result | Failure) -> None:
@@ -369,7 +374,7 @@ class _Stream(AsyncGenerator[bytes, None]):
         self._over = False
 
     async def asend(self, value: None) -> bytes:  # noqa: ARG002 - as generators have it
-        """The latest preview once there is one, or the answer; after that, the end."""
+        """The next preview once there is one, or the answer; after that, the end."""
         if self._over:
             raise StopAsyncIteration
         try:
@@ -379,7 +384,7 @@ class _Stream(AsyncGenerator[bytes, None]):
         except asyncio.CancelledError:
             self._end()
             raise
-        if not self._job.answered.done():
+        with suppress(IndexError):
             return self._job.shown.popleft()
         self._over = True
         return self._job.answered.result()

@@ -29,7 +29,7 @@ from service.errors import (
     ServiceError,
     UnavailableError,
 )
-from service.worker import Load, Timing, Worker
+from service.worker import MAX_UNREAD_BYTES, Load, Timing, Worker
 
 WALK = Request(observation=walking().astype(np.float32), num_samples=2)
 HUGE = replace(WALK, num_samples=2000)
@@ -301,27 +301,29 @@ def test_stream_ends_with_the_plain_answer(start: Callable[..., Worker]):
     assert set(steps) <= set(range(1, NUM_STEPS))
 
 
-def test_slow_reader_gets_the_latest_preview(start: Callable[..., Worker], runner: HeldRunner):
+@pytest.mark.parametrize("size", [1, MAX_UNREAD_BYTES])
+def test_previews_wait_for_their_reader_as_far_as_there_is_room(
+    start: Callable[..., Worker], size: int
+):
     worker = start(threads=1)
-    shown = Event()
+    ended = Event()
 
-    def held_at_five(preview: Preview) -> bytes:
-        if preview.steps_run == 5:
-            runner.may_run.clear()
-            shown.set()
-        return step_number(preview)
+    def long_preview(preview: Preview) -> bytes:
+        return bytes([preview.steps_run]) * size
+
+    def last(*result: Any) -> bytes:
+        ended.set()
+        return answer(*result)
 
     async def streamed() -> list[bytes]:
-        stream = worker.stream(replace(WALK, previews=True), answer, held_at_five)
-        runner.running.clear()
-        await asyncio.to_thread(shown.wait)
-        await after_its_rows_run(runner)  # the turn after, so that this preview has been told of
-        first = await anext(stream)
-        runner.may_run.set()
-        return [first, *await items(stream)]
+        stream = worker.stream(replace(WALK, previews=True), last, long_preview)
+        await asyncio.to_thread(ended.wait)
+        return await items(stream)
 
-    first, *_ = run(streamed())
-    assert first in {b"4", b"5"}
+    *previews, final = run(streamed())
+    waiting = range(1, NUM_STEPS) if size == 1 else [NUM_STEPS - 1]
+    assert [preview[0] for preview in previews] == list(waiting)
+    assert final == run(worker.predict(WALK, answer))
 
 
 @pytest.mark.parametrize("begun", [True, False])

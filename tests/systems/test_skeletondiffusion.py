@@ -277,6 +277,20 @@ def test_linear_parts_reconstruct_motions_that_principal_components_span():
     assert error.mean().item() < 0.2 * still.mean().item()
 
 
+def test_latents_start_as_alike_along_limbs_as_turning_can_make_them():
+    graph = with_root(BODY21)
+    found = torch.randn(21, 500, 4, generator=generator())
+    for parent, child in graph.edges:  # a child's latents are its parent's, turned by its type
+        hidden = torch.linalg.qr(torch.full((4, 4), float(graph.types[child])) + torch.eye(4))[0]
+        found[child] = found[parent] @ hidden
+    turns = objective._turns(found, graph)
+    turned = torch.stack([found[n] @ turns[kind] for n, kind in enumerate(graph.types)])
+    for parent, child in graph.edges:
+        torch.testing.assert_close(turned[child], turned[parent], atol=1e-3, rtol=0)
+    for turn in turns.values():
+        torch.testing.assert_close(turn @ turn.T, torch.eye(4), atol=1e-5, rtol=0)
+
+
 def test_candidate_nearest_to_the_real_motion_learns():
     network = random_like(recipes.tiny().build())
     poses = torch.cat([body(75), body(75, speed=0.5)])

@@ -12,6 +12,7 @@ from models.diffusion import Schedule, q_sample
 from models.system import Batch, Losses
 from models.systems.skeletondiffusion.networks import Decoder, Denoiser, Encoder, PastNetwork
 from models.systems.skeletondiffusion.nodes import VELOCITY, LimbNodes, RootRelativeNodes
+from models.systems.skeletondiffusion.noise import NodeGraph
 from models.systems.skeletondiffusion.typed_graph import mixed
 
 JUDGED_EVERY = 3
@@ -141,6 +142,8 @@ def fit_linear_parts(
 ) -> None:
     """Measure the limbs' scale, and start the shortcuts as principal components of each type.
 
+    Each type's components are turned until its latents go together with its neighbours': the noise
+    supposes that they do (eq. 4), and components as such have neither order nor sign in common.
     The recurrences beside them start from nothing and learn what a linear code cannot say.
 
     Args:
@@ -173,9 +176,31 @@ def fit_linear_parts(
         decode.weight[kind, -latent:] = torch.matmul(to_points, back).flatten(1)
         glide = torch.matmul(to_points, nodes.glide) / nodes.scale[types == kind][0]
         decode.weight[kind, VELOCITY] = -torch.kron(glide.T, torch.eye(3))
+    latents = torch.bmm(motions, encode.weight[types])
+    latents -= latents.mean(dim=1, keepdim=True)
+    for kind, turn in _turns(latents, nodes.graph).items():
+        encode.weight[kind] = encode.weight[kind] @ turn
+        decode.weight[kind, -latent:] = turn.T @ decode.weight[kind, -latent:]
     for last in (network.encoder.latent.features, network.decoder.out.features):
         for parameter in last.parameters():
             parameter.zero_()
+
+
+def _turns(latents: Float[Tensor, "N B L"], graph: NodeGraph) -> dict[int, Float[Tensor, "L L"]]:
+    """For each type but the root's the rotation that makes its covariance with parents greatest.
+
+    Types form a tree as joints do, so from the root on each answer stands (Procrustes).
+    """
+    turns = {graph.types[0]: torch.eye(latents.shape[2])}
+    for kind in range(1, graph.num_types):
+        limbs = [(one, other) for one, other in graph.edges if graph.types[other] == kind]
+        together = sum(
+            latents[child].T @ latents[parent] @ turns[graph.types[parent]]
+            for parent, child in limbs
+        )
+        left, _, right = torch.linalg.svd(together)
+        turns[kind] = left @ right
+    return turns
 
 
 @torch.no_grad()
