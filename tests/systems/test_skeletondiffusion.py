@@ -284,10 +284,10 @@ def test_latents_start_as_alike_along_limbs_as_turning_can_make_them():
         hidden = torch.linalg.qr(torch.full((4, 4), float(graph.types[child])) + torch.eye(4))[0]
         found[child] = found[parent] @ hidden
     turns = objective._turns(found, graph)
-    turned = torch.stack([found[n] @ turns[kind] for n, kind in enumerate(graph.types)])
+    turned = torch.bmm(found, turns[torch.tensor(graph.types)])
     for parent, child in graph.edges:
         torch.testing.assert_close(turned[child], turned[parent], atol=1e-3, rtol=0)
-    for turn in turns.values():
+    for turn in turns:
         torch.testing.assert_close(turn @ turn.T, torch.eye(4), atol=1e-5, rtol=0)
 
 

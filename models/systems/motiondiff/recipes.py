@@ -9,7 +9,7 @@ from models.diffusion import linear_schedule
 from models.motion.skeleton import HUMANEVA15
 from models.pose import RootRelativePoses, WorldPoses
 from models.protocols import H36M, HELD_OUT, TWO_SECONDS, mocap_data
-from models.system import Data, Recipe, Stage, stepwise
+from models.system import Data, Recipe, Stage, goes_on, stepwise
 from models.systems.motiondiff import keyframes, objective, paper
 from models.systems.motiondiff.graphs import graphs
 from models.systems.motiondiff.objective import MotionDiff
@@ -152,6 +152,13 @@ def mocap_held_out() -> Recipe:
 def mocap_diffusion_held_out() -> Recipe:
     """`mocap_held_out` without refinement: its first stage, shown as it is."""
     return _without_refinement(mocap_held_out(), name="mocap_diffusion_held_out")
+
+
+def mocap_diffusion_longer() -> Recipe:
+    """A finished `mocap_diffusion_held_out` goes on: what is refined and measured."""
+    return goes_on(
+        "mocap_diffusion_longer", mocap_diffusion_held_out(), num_updates=9_000, learning_rate=8e-4
+    )
 
 
 def mocap_refinement_held_out() -> Recipe:

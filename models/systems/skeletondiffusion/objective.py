@@ -142,8 +142,8 @@ def fit_linear_parts(
 ) -> None:
     """Measure the limbs' scale, and start the shortcuts as principal components of each type.
 
-    Each type's components are turned until its latents go together with its neighbours': the noise
-    supposes that they do (eq. 4), and components as such have neither order nor sign in common.
+    Each type's components are turned until they go together with its neighbours', so that one
+    channel means the same to all: as such they have neither order nor sign in common.
     The recurrences beside them start from nothing and learn what a linear code cannot say.
 
     Args:
@@ -176,31 +176,30 @@ def fit_linear_parts(
         decode.weight[kind, -latent:] = torch.matmul(to_points, back).flatten(1)
         glide = torch.matmul(to_points, nodes.glide) / nodes.scale[types == kind][0]
         decode.weight[kind, VELOCITY] = -torch.kron(glide.T, torch.eye(3))
-    latents = torch.bmm(motions, encode.weight[types])
-    latents -= latents.mean(dim=1, keepdim=True)
-    for kind, turn in _turns(latents, nodes.graph).items():
-        encode.weight[kind] = encode.weight[kind] @ turn
-        decode.weight[kind, -latent:] = turn.T @ decode.weight[kind, -latent:]
+    turns = _turns(torch.bmm(motions, encode.weight[types]), nodes.graph)
+    encode.weight.copy_(torch.bmm(encode.weight, turns))
+    decode.weight[:, -latent:] = torch.bmm(turns.transpose(1, 2), decode.weight[:, -latent:])
     for last in (network.encoder.latent.features, network.decoder.out.features):
         for parameter in last.parameters():
             parameter.zero_()
 
 
-def _turns(latents: Float[Tensor, "N B L"], graph: NodeGraph) -> dict[int, Float[Tensor, "L L"]]:
-    """For each type but the root's the rotation that makes its covariance with parents greatest.
+def _turns(latents: Float[Tensor, "N B L"], graph: NodeGraph) -> Float[Tensor, "types L L"]:
+    """For each type the rotation that makes its covariance with its parents' latents greatest.
 
     Types form a tree as joints do, so from the root on each answer stands (Procrustes).
     """
-    turns = {graph.types[0]: torch.eye(latents.shape[2])}
+    centred = latents - latents.mean(dim=1, keepdim=True)
+    turns = [torch.eye(latents.shape[2])]
     for kind in range(1, graph.num_types):
-        limbs = [(one, other) for one, other in graph.edges if graph.types[other] == kind]
-        together = sum(
-            latents[child].T @ latents[parent] @ turns[graph.types[parent]]
-            for parent, child in limbs
-        )
-        left, _, right = torch.linalg.svd(together)
-        turns[kind] = left @ right
-    return turns
+        together = [
+            centred[child].T @ centred[parent] @ turns[graph.types[parent]]
+            for parent, child in graph.edges
+            if graph.types[child] == kind
+        ]
+        left, _, right = torch.linalg.svd(torch.stack(together).sum(dim=0))
+        turns.append(left @ right)
+    return torch.stack(turns)
 
 
 @torch.no_grad()
