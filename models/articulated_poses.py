@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.articulation import Articulation, from_6d, to_6d
+from models.articulation import Articulation, to_6d
 from models.layers import in_lanes
 from models.motion.skeleton import Skeleton
 from models.pose import Frame, facing
@@ -77,34 +77,41 @@ class ArticulatedPoses(nn.Module):
         features = torch.cat([rotations, torch.cat([first, changes], dim=1)], dim=2)
         return features, self.articulation.bones(canonical, frames)
 
+    def standing(
+        self, observation: Float[Tensor, "B T J 3"]
+    ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 4"]]:
+        """Where the root was last seen, and the ground from which `leave` goes on there."""
+        frame = Frame(observation, self._pairs)
+        cos, sin = frame.turn[:, 0, :1], frame.turn[:, 1, :1]
+        return frame.origin[:, 0, 0], torch.cat([cos, sin, 0.0 * cos, 0.0 * cos], dim=1)
+
     def leave(
         self,
-        observation: Float[Tensor, "B T J 3"],
         features: Float[Tensor, "B L F"],
-        bones: Float[Tensor, "B J 3"],
-        start: Float[Tensor, "B 3"],
-    ) -> tuple[Float[Tensor, "B L J 3"], Float[Tensor, "B 3"]]:
-        """Poses in the observation's world, and heading and place of the last one.
+        arms: Float[Tensor, "B J A"],
+        origin: Float[Tensor, "B 3"],
+        ground: Float[Tensor, "B 4"],
+    ) -> tuple[Float[Tensor, "B L J 3"], Float[Tensor, "B 4"]]:
+        """Poses in the world, and the ground after them.
 
-        ``start`` is the canonical heading (radians) and place (x, y) of the frame before the first.
+        ``origin`` and the first ``ground`` are from `standing`. The ground is cosine and sine of
+        the heading, and the place (x, y) from the origin, of the frame before the first.
         """
-        frame = Frame(observation, self._pairs)
         rows = features.permute(2, 0, 1)  # (F, B, L)
-        turn, forward, left, height = (rows[-4:] * self.units[:, None, None]).unbind()
-        headings = torch.cat([start[:, :1], start[:, :1] + turn.cumsum(dim=1)], dim=1)
-        cos, sin = in_lanes(torch.cos, headings), in_lanes(torch.sin, headings)
-        x, y = _turned(cos[:, :-1], sin[:, :-1], forward, left)
-        x, y = start[:, 1:2] + x.cumsum(dim=1), start[:, 2:] + y.cumsum(dim=1)
-        last = torch.stack([headings[:, -1], x[:, -1], y[:, -1]], dim=1)
-        # From here on in the world.
-        yaw = frame.turn[:, 0, :1], frame.turn[:, 1, :1]
-        root = torch.stack([*_turned(*yaw, x, y), height], dim=2) + frame.origin[:, :, 0]
-        cos, sin = _turned(*yaw, cos[:, 1:], sin[:, 1:])
-        rotations = from_6d(rows[:-4].reshape(len(rows) // 6, 6, -1, features.shape[1]))
-        along, across, up = rotations[:1].unbind(dim=2)
-        upright = torch.stack([*_turned(cos, sin, along, across), up], dim=2)
-        rotations = torch.cat([upright, rotations[1:]])
-        return self.articulation.positions(rotations, bones, root), last
+        rotations, changes = torch.split(rows, [self.num_features - 4, 4])
+        changes = changes * self.units[:, None, None]
+        turn, forward, left, height = torch.split(changes, 1)
+        angle = turn.cumsum(dim=2)
+        before, start = torch.split(ground.T[:, :, None], 2)
+        cos, sin = torch.split(before, 1)
+        turned = _turned(cos, sin, in_lanes(torch.cos, angle), in_lanes(torch.sin, angle))
+        heading = torch.cat(turned)
+        # A step is told in the heading of the frame before.
+        cos, sin = torch.split(torch.cat([before, heading[:, :, :-1]], dim=2), 1)
+        place = start + torch.cat(_turned(cos, sin, forward, left)).cumsum(dim=2)
+        root = torch.cat([place, height]) + origin.T[:, :, None]
+        after = torch.cat([heading, place])[:, :, -1].T
+        return self.articulation.positions(rotations, arms, root, heading), after
 
     def _felt(
         self, canonical: Float[Tensor, "B L J 3"], frames: Float[Tensor, "N 3 3 B L"]

@@ -31,6 +31,7 @@ class Articulation(nn.Module):
 
     rest_direction: Tensor
     path: Tensor
+    carried: Tensor
     lines: Tensor
 
     def __init__(self, skeleton: Skeleton) -> None:
@@ -42,6 +43,8 @@ class Articulation(nn.Module):
         self._branching = [j for j in self.turning if len(self._children[j]) > 1]
         # Joints of one level are computed together: a graph's calls cost more than its numbers.
         self._levels = _levels(self.turning, self.parents)
+        by_level = [joint for joints in self._levels for joint in joints]
+        self._by_level = [self.turning.index(joint) for joint in by_level]
         swinging = [j for j in self.turning if len(self._children[j]) == 1]
         self._swinging = _levels(swinging, self.parents)
         rest = torch.zeros(skeleton.num_joints, 3)  # until fitted: trunks rise, limbs hang
@@ -52,6 +55,11 @@ class Articulation(nn.Module):
             path[joint] += path[parent]
         path[:, 0] = 0.0
         self.register_buffer("path", path, persistent=False)
+        carrying = torch.zeros(len(by_level), skeleton.num_joints)  # which joint turns which bone
+        for joint, parent in enumerate(self.parents[1:], start=1):
+            carrying[by_level.index(parent), joint] = 1.0
+        carried = path[:, None] * carrying  # (J, K, J)
+        self.register_buffer("carried", carried.flatten(0, 1), persistent=False)
         lines = torch.zeros(2, len(self._branching), skeleton.num_joints)
         for i, joint in enumerate(self._branching):
             lines[:, i] = _axes(joint, skeleton)
@@ -109,25 +117,37 @@ class Articulation(nn.Module):
         mean = poses.new_full((poses.shape[1], LANES), 1.0 / poses.shape[1])
         return torch.matmul(torch.cat([bones, own])[sources], mean)[..., 0].permute(2, 0, 1)
 
+    def arms(self, bones: Float[Tensor, "B J 3"]) -> Float[Tensor, "B J A"]:
+        """What every joint is away from the root, in the axes of all that turn: for `positions`."""
+        arms = torch.matmul(self.carried, bones)
+        return arms.reshape(-1, len(self.parents), 3 * len(self.turning))
+
     def positions(
         self,
-        rotations: Float[Tensor, "K 3 3 B L"],
-        bones: Float[Tensor, "B J 3"],
-        root: Float[Tensor, "B L 3"],
+        values: Float[Tensor, "K6 B L"],
+        arms: Float[Tensor, "B J A"],
+        root: Float[Tensor, "3 B L"],
+        heading: Float[Tensor, "2 B L"] | None = None,
     ) -> Float[Tensor, "B L J 3"]:
-        """Forward kinematics: p_j = p_parent + G_parent b_j."""
-        row = rotations.new_ones(rotations.shape[-1])
-        arms = bones.permute(1, 2, 0)[:, None, :, :, None] * row  # (J, 1, 3, B, L)
-        (root_joint,), *others = self._levels
-        frames, order = rotations[:1], [root_joint]
-        for joints in others:
-            above = frames[[order.index(self.parents[j]) for j in joints]]
-            own = rotations[[self.turning.index(j) for j in joints]]
-            frames, order = torch.cat([frames, _product(above, own)]), [*order, *joints]
-        above = frames[[order.index(max(parent, 0)) for parent in self.parents]]
-        turned = _product(above, arms)[:, 0]
-        placed = _weighted(self.path, turned) + root.permute(2, 0, 1)
-        return placed.permute(2, 3, 0, 1)
+        """Forward kinematics of `to_6d` rotations: p_j = p_parent + G_parent b_j.
+
+        ``heading``, a cosine and a sine, turns the whole body about the third axis. The numbers of
+        all people and frames stay in rows until they are positions.
+        """
+        num_frames = int(values.shape[2])  # a plain number, so that a graph need not ask for it
+        values = values.reshape(len(self.turning), 6, -1, num_frames)[self._by_level]
+        first, *others = torch.split(from_6d(values), [len(joints) for joints in self._levels])
+        frames = [first if heading is None else _headed(first, heading)]
+        for above, joints, own in zip(self._levels, self._levels[1:], others, strict=False):
+            carrier = frames[-1]
+            places = [above.index(self.parents[joint]) for joint in joints]
+            if len(above) > 1 and places != list(range(len(above))):
+                carrier = carrier[places]
+            frames.append(_product(carrier, own))
+        axes = torch.cat(frames).permute(3, 0, 1, 2, 4)  # (B, K, 3, 3, L)
+        axes = axes.reshape(-1, 3 * len(self.turning), 3 * num_frames)
+        placed = torch.matmul(arms, axes) + root.permute(1, 0, 2).reshape(-1, 1, 3 * num_frames)
+        return placed.reshape(-1, len(self.parents), 3, num_frames).permute(0, 3, 1, 2)
 
     def _above(self, joints: Sequence[int]) -> list[int]:
         """Where the parents of joints are among `frames`."""
@@ -195,43 +215,57 @@ def _weighted(
 
 
 def _product(
-    matrices: Float[Tensor, "n 3 3 B L"], columns: Float[Tensor, "n c 3 B L"]
+    matrices: Float[Tensor, "#n 3 3 B L"], columns: Float[Tensor, "n c 3 B L"]
 ) -> Float[Tensor, "n c 3 B L"]:
     """Products of matrices with the columns of others."""
-    x, y, z = (matrices[:, i : i + 1] * columns[:, :, i : i + 1] for i in range(3))
+    parts = zip(torch.split(matrices, 1, dim=1), torch.split(columns, 1, dim=2), strict=True)
+    x, y, z = (matrix * column for matrix, column in parts)
     return x + y + z
+
+
+def _headed(
+    rotations: Float[Tensor, "1 3 3 B L"], heading: Float[Tensor, "2 B L"]
+) -> Float[Tensor, "1 3 3 B L"]:
+    """Rotations after a turn about the third axis."""
+    x, y, z = torch.split(rotations, 1, dim=2)
+    cos, sin = torch.split(heading, 1)
+    return torch.cat([cos * x - sin * y, sin * x + cos * y, z], dim=2)
 
 
 def _unit(vectors: Float[Tensor, "n 3 *B"]) -> Float[Tensor, "n 3 *B"]:
     return vectors / vectors.square().sum(dim=1, keepdim=True).add(_EPSILON**2).sqrt()
 
 
-def _cross(a: Float[Tensor, "n 3 *B"], b: Float[Tensor, "n 3 *B"]) -> Float[Tensor, "n 3 *B"]:
-    x, y, z = a.unbind(dim=1)
-    u, v, w = b.unbind(dim=1)
-    return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u], dim=1)
+def _cross(a: Float[Tensor, "n 3 *#B"], b: Float[Tensor, "n 3 *#B"]) -> Float[Tensor, "n 3 *#B"]:
+    x, y, z = torch.split(a, 1, dim=1)
+    u, v, w = torch.split(b, 1, dim=1)
+    return torch.cat([y * w - z * v, z * u - x * w, x * v - y * u], dim=1)
 
 
 def _swing(rest: Float[Tensor, "n 3"], to: Float[Tensor, "n 3 B L"]) -> Float[Tensor, "n 3 3 B L"]:
     """The shortest rotation that takes unit vectors to others: 1 + V + V V / (1 + cos)."""
     rest = rest[:, :, None, None]
-    x, y, z = _cross(rest.expand_as(to), to).unbind(dim=1)
+    axis = _cross(rest, to)
+    x, y, z = torch.split(axis, 1, dim=1)
     zero = 0.0 * x
-    columns = ([zero, z, -y], [-z, zero, x], [y, -x, zero])
-    v = torch.stack([torch.stack(column, dim=1) for column in columns], dim=1)
-    cosine = (rest * to).sum(dim=1)[:, None, None]
+    columns = torch.cat([zero, z, -y, -z, zero, x, y, -x, zero], dim=1)
+    v = columns.reshape(len(rest), 3, 3, -1, int(to.shape[3]))
+    share = 1.0 / (1.0 + (rest * to).sum(dim=1, keepdim=True)).clamp(min=1e-4)
     eye = torch.eye(3, dtype=to.dtype, device=to.device)[:, :, None, None]
-    return eye + v + _product(v, v) / (1.0 + cosine).clamp(min=1e-4)
+    # V V is v v - |v|^2, v their cross product.
+    along = axis[:, None] * (share * axis)[:, :, None]
+    return (1.0 - share * axis.square().sum(dim=1, keepdim=True))[:, None] * eye + v + along
 
 
-def to_6d(rotations: Float[Tensor, "K 3 3 *B"]) -> Float[Tensor, "K 6 *B"]:
+def to_6d(rotations: Float[Tensor, "K 3 3 B L"]) -> Float[Tensor, "K 6 B L"]:
     """The first two columns of rotation matrices (Zhou et al. 2019)."""
     return rotations[:, :2].flatten(1, 2)
 
 
-def from_6d(values: Float[Tensor, "K 6 *B"]) -> Float[Tensor, "K 3 3 *B"]:
+def from_6d(values: Float[Tensor, "K 6 B L"]) -> Float[Tensor, "K 3 3 B L"]:
     """Rotation matrices from two columns that need be neither of length 1 nor orthogonal."""
-    first = _unit(values[:, :3])
-    second = values[:, 3:]
+    first, second = torch.split(values, 3, dim=1)
+    first = _unit(first)
     second = _unit(second - (first * second).sum(dim=1, keepdim=True) * first)
-    return torch.stack([first, second, _cross(first, second)], dim=1)
+    columns = torch.cat([first, second, _cross(first, second)], dim=1)
+    return columns.reshape(len(values), 3, 3, -1, int(values.shape[3]))

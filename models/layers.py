@@ -16,10 +16,11 @@ def in_lanes(
 ) -> Float[Tensor, "*B"]:
     """A sine, say, that rounds alike for a row whatever its batch, in an exported graph too.
 
-    onnxruntime's vector code and its code for what is left over round differently; of eight
-    columns nothing is left over.
+    onnxruntime's vector code and its code for what is left over round differently; of rows of
+    eight, or twice as many, nothing is left over.
     """
-    return function(values[..., None] * values.new_ones(LANES))[..., 0]
+    width = int(values.shape[-1])
+    return function(nn.functional.pad(values, (0, -width % LANES)))[..., :width]
 
 
 class MLP(nn.Sequential):

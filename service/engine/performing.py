@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from models.bundle import ActionsSpec
-from service.engine.context import Context, Tensors, joined, unencoded
+from service.engine.context import Context, Tensors, gathered, joined, unencoded
 from service.engine.costs import Costs
 from service.engine.runner import Runner
 from service.engine.sampling import noise
@@ -131,6 +131,8 @@ class Performer:
         self._spec = spec
         self._encoder_draws = runner.takes("encoder", "noise")
         self._draws = self._encoder_draws or runner.takes("decoder", "noise")
+        decoder = self._manifest.decoder
+        self._asked = [tensor.name for tensor in decoder.inputs if tensor.name != "noise"]
 
     def steps_of(self, request: Request) -> int:
         """The chunks of all its actions at their longest."""
@@ -183,13 +185,14 @@ class Performer:
             for name, values in outputs.items()
             if name.startswith(NEXT)
         }
-        context = joined([(part.context, len(part))])
+        # What was for the encoder alone would be copied with these rows wherever they part.
+        kept = gathered(self._asked, [(part.context, len(part))])
         part = replace(
             part,
             turns_left=part.turns_left - 1,
             steps_run=part.steps_run + 1,
             chunks=(*part.chunks, chunk),
-            context=Context(tensors=context.tensors | state, encoded=True),
+            context=Context(tensors=kept | state, encoded=True),
         )
         rest = self._rests(part, before, outputs.get(EARLIEST_END))
         is_over = (rest >= 0) | (part.num_made >= longest)
@@ -197,7 +200,7 @@ class Performer:
         if not is_over.all():
             after.append(part.part(np.flatnonzero(~is_over)))
         if is_over.any():
-            after += self._turned(part.part(np.flatnonzero(is_over)), rest[is_over])
+            after += self._turned(part, np.flatnonzero(is_over), rest)
         return after
 
     def _rests(
@@ -227,19 +230,25 @@ class Performer:
     def _turned(
         self,
         part: Performance,
+        rows: Int64[np.ndarray, "m"],
         rest: Int64[np.ndarray, "n"],
     ) -> list[Performance | Samples]:
         """Samples whose action has just ended, before the next one; after the last, whole."""
         found = [
             part.ended(row, part.num_made if frame < 0 else frame + 1, stopped=frame >= 0)
-            for row, frame in enumerate(rest.tolist())
+            for row, frame in zip(rows.tolist(), rest[rows].tolist(), strict=True)
         ]
         actions = part.request.actions[part.actions_ended + 1 :]
         if not actions:
-            return [self._whole(part, row, *one, stopped_by="end") for row, one in enumerate(found)]
+            return [
+                self._whole(part, row, *one, stopped_by="end")
+                for row, one in zip(rows.tolist(), found, strict=True)
+            ]
         seen = np.stack([frames[-self._manifest.num_observed :] for frames, _ in found])
         following = replace(
             part,
+            sample_indices=part.sample_indices[rows],
+            steps_run=part.steps_run[rows],
             turns_left=self._turns(part.request, num_actions=len(actions)),
             context=_before(seen, action=actions[0]),
             past=tuple(frames for frames, _ in found),

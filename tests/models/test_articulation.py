@@ -23,6 +23,16 @@ def bent(articulation: Articulation, *, seed: int = 0) -> torch.Tensor:
     return from_6d(straight[:, None, None] + 0.3 * drawn)
 
 
+def posed(
+    articulation: Articulation,
+    rotations: torch.Tensor,
+    bones: torch.Tensor,
+    root: torch.Tensor,
+) -> torch.Tensor:
+    values = to_6d(rotations).flatten(0, 1)
+    return articulation.positions(values, articulation.arms(bones), root.permute(2, 0, 1))
+
+
 def rotations_of(articulation: Articulation, poses: torch.Tensor) -> torch.Tensor:
     return articulation.rotations(articulation.frames(poses))
 
@@ -36,11 +46,17 @@ def test_positions_of_rotations_are_the_poses(skeleton):
     articulation = Articulation(skeleton)
     poses = walk(skeleton)
     # Siblings must keep their angles, as they do on a body that is made of rotations.
-    rigid = articulation.positions(
-        rotations_of(articulation, poses), bones_of(articulation, poses[:, :1]), poses[:, :, 0]
+    rigid = posed(
+        articulation,
+        rotations_of(articulation, poses),
+        bones_of(articulation, poses[:, :1]),
+        poses[:, :, 0],
     )
-    again = articulation.positions(
-        rotations_of(articulation, rigid), bones_of(articulation, rigid), rigid[:, :, 0]
+    again = posed(
+        articulation,
+        rotations_of(articulation, rigid),
+        bones_of(articulation, rigid),
+        rigid[:, :, 0],
     )
     torch.testing.assert_close(again, rigid, atol=2e-4, rtol=0)
 
@@ -48,12 +64,22 @@ def test_positions_of_rotations_are_the_poses(skeleton):
 def test_bones_keep_their_length_whatever_the_rotations():
     articulation = Articulation(BODY21)
     bones = bones_of(articulation, walk())
-    poses = articulation.positions(
-        bent(articulation), bones.expand(2, -1, -1), torch.zeros(2, 4, 3)
-    )
+    poses = posed(articulation, bent(articulation), bones.expand(2, -1, -1), torch.zeros(2, 4, 3))
     parents = list(BODY21.parents[1:])
     lengths = (poses[:, :, 1:] - poses[:, :, parents]).norm(dim=-1)
     torch.testing.assert_close(lengths, bones[:, 1:].norm(dim=-1).expand_as(lengths))
+
+
+def test_heading_turns_the_whole_body():
+    articulation = Articulation(BODY21)
+    bones, angle = bones_of(articulation, walk()).expand(2, -1, -1), 2.0
+    values, root = to_6d(bent(articulation)).flatten(0, 1), torch.zeros(3, 2, 4)
+    heading = torch.tensor([np.cos(angle), np.sin(angle)], dtype=torch.float32)
+    arms = articulation.arms(bones)
+    turned = articulation.positions(values, arms, root, heading[:, None, None].expand(-1, 2, 4))
+    plain = articulation.positions(values, arms, root)
+    expected = torch.from_numpy(rotate_yaw(plain.numpy(), angle)).float()
+    torch.testing.assert_close(turned, expected, atol=1e-5, rtol=0)
 
 
 def test_rotations_are_rotations():
@@ -80,7 +106,7 @@ def test_siblings_on_one_point_get_their_frame_from_their_children():
     poses[:, :, left] = poses[:, :, right] = poses[:, :, BODY21.index("neck")]
     articulation = Articulation(BODY21)
     rotations = rotations_of(articulation, poses)
-    again = articulation.positions(rotations, bones_of(articulation, poses), poses[:, :, 0])
+    again = posed(articulation, rotations, bones_of(articulation, poses), poses[:, :, 0])
     torch.testing.assert_close(again[:, :, chest:], poses[:, :, chest:], atol=1e-3, rtol=0)
 
 
@@ -107,11 +133,11 @@ def test_poses_return_from_their_features():
     poses.fit(observation)
     rigid = bones_of(poses.articulation, observation)
     features = poses.enter(observation, future)
-    ground = torch.zeros(1, 3)
-    again, arrived = poses.leave(observation, features, rigid, ground)
+    arms, (origin, ground) = poses.articulation.arms(rigid), poses.standing(observation)
+    again, arrived = poses.leave(features, arms, origin, ground)
     torch.testing.assert_close(again, future, atol=0.02, rtol=0)  # walking() is not quite rigid
-    half, between = poses.leave(observation, features[:, :20], rigid, ground)
-    rest, end = poses.leave(observation, features[:, 20:], rigid, between)
+    half, between = poses.leave(features[:, :20], arms, origin, ground)
+    rest, end = poses.leave(features[:, 20:], arms, origin, between)
     torch.testing.assert_close(torch.cat([half, rest], dim=1), again, atol=1e-5, rtol=0)
     torch.testing.assert_close(end, arrived, atol=1e-5, rtol=0)
 
@@ -134,7 +160,8 @@ def test_weighted_error_is_about_the_squared_distance_of_the_poses():
     poses = ArticulatedPoses(BODY21)
     observation = walk(num_frames=15)
     poses.fit(observation)
-    bones = poses.enter_observation(observation)[1]
+    arms = poses.articulation.arms(poses.enter_observation(observation)[1])
+    origin, ground = poses.standing(observation)
     features = poses.enter(observation, observation[:, -1:])
     generator = torch.Generator().manual_seed(0)
     ratios = []
@@ -142,7 +169,7 @@ def test_weighted_error_is_about_the_squared_distance_of_the_poses():
         noise = torch.randn(features.shape, generator=generator) * 0.02
         noise[..., -4:] = 0.0
         error = (noise.square() * poses.weights).sum()
-        plain, _ = poses.leave(observation, features, bones, torch.zeros(1, 3))
-        moved, _ = poses.leave(observation, features + noise, bones, torch.zeros(1, 3))
+        plain, _ = poses.leave(features, arms, origin, ground)
+        moved, _ = poses.leave(features + noise, arms, origin, ground)
         ratios.append(float((moved - plain).square().sum() / error))
     assert 0.4 < np.median(ratios) < 1.6

@@ -234,14 +234,14 @@ def test_joined_frames_go_on_where_the_observation_was_heading():
     wat = network()
     width = wat.poses.num_features
     observed, features = drawn(2, 15, width), drawn(2, 40, width, seed=1)
-    joined = wat.joined(features, observed, torch.ones(2, 1))
+    joined = wat.joined(features, wat.bound_for(observed), torch.ones(2, 1))
     heading = (observed[:, -1] - observed[:, -3]) / 2 * wat.momentum
     torch.testing.assert_close(joined[:, 0], observed[:, -1] + heading)
     torch.testing.assert_close(joined[:, 1], observed[:, -1] + 2 * heading, atol=1e-5, rtol=0)
     assert torch.equal(joined[:, objective.FADED_AFTER :], features[:, objective.FADED_AFTER :])
     gap = (joined - features)[:, objective.FADED_AFTER - 1].abs().max()
     assert gap < 0.1 * (joined - features)[:, 0].abs().max()
-    assert torch.equal(wat.joined(features, observed, torch.zeros(2, 1)), features)
+    assert torch.equal(wat.joined(features, wat.bound_for(observed), torch.zeros(2, 1)), features)
 
 
 def test_smooth_prior_lets_slow_motion_pass_and_not_a_jump():

@@ -28,53 +28,59 @@ class Encoder(nn.Module):
     def forward(
         self, observation: Float[Tensor, "B T J 3"], action: Int[Tensor, "B"]
     ) -> tuple[Tensor, ...]:
-        """The prior of z, the bones, where the person stands, and the form's own tensors."""
-        observed, bones = self.network.poses.enter_observation(observation)
+        """The prior of z, the person's body, place and heading, and the form's own tensors."""
+        poses = self.network.poses
+        observed, bones = poses.enter_observation(observation)
+        origin, ground = poses.standing(observation)
         (mean, log_variance), own = self.network.begin(observed, action)
         beginning = 1.0 + 0.0 * mean[:, :1]  # ones_like would fix the batch's size
-        ground = 0.0 * bones[:, 0]  # heading, x, y
         deviation = (0.5 * log_variance).exp()
         narrowed = self.spread * deviation[:, :-NUM_TIMES]
         deviation = torch.cat([narrowed, deviation[:, -NUM_TIMES:]], dim=1)
-        return mean, deviation, bones, observed[:, -3:], beginning, ground, *own
+        arms, bound_for = poses.articulation.arms(bones), self.network.bound_for(observed)
+        return mean, deviation, arms, bound_for, origin, beginning, ground, *own
 
 
 class Decoder(nn.Module):
     """The next chunk of frames."""
 
-    def __init__(self, network: WAT, *, chunk_frames: int, horizon: int) -> None:
+    most: Tensor
+
+    def __init__(self, network: WAT, *, size_of_z: int, chunk_frames: int, horizon: int) -> None:
         super().__init__()
         self.network = network
         self.chunk_frames = chunk_frames
-        self.longest = math.log((horizon - FRAMES_AT_REST) / LENGTH_UNIT)
+        most = torch.full((size_of_z,), math.inf)
+        most[-NUM_TIMES] = math.log((horizon - FRAMES_AT_REST) / LENGTH_UNIT)
+        self.register_buffer("most", most)
 
     def forward(  # noqa: PLR0913 - the tensors of the graph
         self,
         noise: Float[Tensor, "B Z"],
-        observation: Float[Tensor, "B T J 3"],
         mean: Float[Tensor, "B Z"],
         deviation: Float[Tensor, "B Z"],
-        bones: Float[Tensor, "B J 3"],
-        latest_observed: Float[Tensor, "B 3 F"],
+        arms: Float[Tensor, "B J A"],
+        bound_for: Float[Tensor, "B 2 F"],
+        origin: Float[Tensor, "B 3"],
         beginning: Float[Tensor, "B 1"],
-        ground: Float[Tensor, "B 3"],
+        ground: Float[Tensor, "B 4"],
         *own: Tensor,
     ) -> tuple[Tensor, ...]:
         """Poses in the world of the observation, and the tensors that the next chunk takes."""
-        z = mean + deviation * noise
-        length = z[:, -NUM_TIMES, None].clamp(max=self.longest)
-        z = torch.cat([z[:, :-NUM_TIMES], length, z[:, 1 - NUM_TIMES :]], dim=1)
+        z = torch.minimum(mean + deviation * noise, self.most)
         features, carried = self.network.form.advance(z, own, self.chunk_frames)
-        features = self.network.joined(features, latest_observed, beginning)
-        future, ground = self.network.poses.leave(observation, features, bones, ground)
-        earliest_end = LENGTH_UNIT * length.exp()
+        features = self.network.joined(features, bound_for, beginning)
+        future, ground = self.network.poses.leave(features, arms, origin, ground)
+        earliest_end = LENGTH_UNIT * z[:, -NUM_TIMES : 1 - NUM_TIMES].exp()
         return future, earliest_end, 0.0 * beginning, ground, *carried
 
 
-def graphs(network: WAT, *, chunk_frames: int, horizon: int, spread: float) -> tuple[Graph, ...]:
+def graphs(
+    network: WAT, *, size_of_z: int, chunk_frames: int, horizon: int, spread: float
+) -> tuple[Graph, ...]:
     """Encoder and decoder of a trained network."""
     kept, carried = network.form.kept, network.form.carried
-    given = ("mean", "deviation", "bones", "latest_observed", "beginning", "ground")
+    given = ("mean", "deviation", "arms", "bound_for", "origin", "beginning", "ground")
     return (
         Graph(
             role="encoder",
@@ -84,8 +90,10 @@ def graphs(network: WAT, *, chunk_frames: int, horizon: int, spread: float) -> t
         ),
         Graph(
             role="decoder",
-            module=Decoder(network, chunk_frames=chunk_frames, horizon=horizon),
-            inputs=("noise", "observation", *given, *kept, *carried),
+            module=Decoder(
+                network, size_of_z=size_of_z, chunk_frames=chunk_frames, horizon=horizon
+            ),
+            inputs=("noise", *given, *kept, *carried),
             outputs=(
                 "future",
                 "earliest_end",

@@ -31,6 +31,7 @@ class WAT(nn.Module):
 
     smooth: Tensor
     fading: Tensor
+    to_fade: Tensor
     momentum: Tensor
 
     def __init__(self, *, poses: ArticulatedPoses, rhythm: Rhythm, form: nn.Module) -> None:
@@ -43,7 +44,8 @@ class WAT(nn.Module):
         self.register_buffer("smooth", basis @ basis.T, persistent=False)
         frame = torch.arange(FADED_AFTER, dtype=torch.float32)
         fading = torch.exp(-frame / FADING_FRAMES)
-        self.register_buffer("fading", torch.stack([fading, frame * fading]), persistent=False)
+        self.register_buffer("fading", torch.stack([fading, frame * fading], 1), persistent=False)
+        self.register_buffer("to_fade", self.fading[:2].inverse(), persistent=False)
         momentum = torch.ones(poses.num_features)
         momentum[-4:-1] = 0.0  # turns and steps are velocities already
         self.register_buffer("momentum", momentum, persistent=False)
@@ -70,10 +72,16 @@ class WAT(nn.Module):
         log_variance = log_variance + POSTERIOR_LOG_VARIANCE
         return mean, log_variance.clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
 
+    def bound_for(self, observed: Float[Tensor, "B T F"]) -> Float[Tensor, "B 2 F"]:
+        """Where an observation was heading: what its next two frames come to as a and b."""
+        heading = (observed[:, -1:] - observed[:, -3:-2]) / 2 * self.momentum
+        first = observed[:, -1:] + heading
+        return torch.matmul(self.to_fade, torch.cat([first, first + heading], dim=1))
+
     def joined(
         self,
         features: Float[Tensor, "B L F"],
-        observed: Float[Tensor, "B T F"],
+        bound_for: Float[Tensor, "B 2 F"],
         beginning: Float[Tensor, "B 1"],
     ) -> Float[Tensor, "B L F"]:
         """The frames, the first two of them moved to where the observation was heading.
@@ -81,12 +89,12 @@ class WAT(nn.Module):
         What they are moved by fades out over the next ones, (a + b t) exp(-t / tau), as animators
         blend from one clip into another. ``beginning`` is 1 for rows whose action begins here.
         """
-        heading = (observed[:, -1] - observed[:, -3]) / 2 * self.momentum
-        first = observed[:, -1] + heading - features[:, 0]
-        second = (observed[:, -1] + 2 * heading - features[:, 1]) / self.fading[0, 1]
-        moved = torch.stack([first, second - first], dim=1) * beginning[:, None]
-        count = min(features.shape[1], FADED_AFTER)
-        correction = torch.matmul(self.fading[:, :count].T, moved)
+        moved = bound_for - torch.matmul(self.to_fade, features[:, :2])
+        fading = self.fading[: int(features.shape[1])]
+        correction = torch.matmul(fading, moved * beginning[:, None])
+        count = len(fading)
+        if count == features.shape[1]:
+            return features + correction
         return torch.cat([features[:, :count] + correction, features[:, count:]], dim=1)
 
 
@@ -177,7 +185,8 @@ def _terms(
     share = least + (most - least) * _uniform(len(z), generator, z)[:, None]
     here = known & (_uniform(known.shape, generator, z) < share)
     predicted, _ = network.form.advance(z, state, num_frames, Told(future, here))
-    predicted = network.joined(predicted, observed, torch.ones_like(z[:, :1]))
+    bound_for = network.bound_for(observed)
+    predicted = network.joined(predicted, bound_for, torch.ones_like(z[:, :1]))
     weight = network.poses.weights.sqrt()
     error = (predicted - future) * weight
     window = torch.cat([observed[:, -HALF_WINDOW:], predicted[:, :HALF_WINDOW]], dim=1) * weight

@@ -235,7 +235,7 @@ def _mocap_data(
             examples=MOCAP_EXAMPLES,
             other_share=other_share,
             padding=padding,
-            chunk_frames=20,
+            chunk_frames=50,
             min_frames=15,
             stop_threshold_m=0.06,
         ),
@@ -411,7 +411,11 @@ def _recipe(
         data=data,
         build=build,
         graphs=partial(
-            graphs, chunk_frames=_actions(data).chunk_frames, horizon=data.horizon, spread=spread
+            graphs,
+            size_of_z=latent + NUM_TIMES,
+            chunk_frames=_actions(data).chunk_frames,
+            horizon=data.horizon,
+            spread=spread,
         ),
         stages=(stage,),
         x_t_shape=(latent + NUM_TIMES,),

@@ -47,6 +47,7 @@ class RecurrentVAE(nn.Module):
     ) -> None:
         super().__init__()
         self.frames_per_step = frames_per_step
+        self.latent, self.hidden = latent, hidden
         patch = features * frames_per_step
         self.action = nn.Embedding(num_actions, hidden)
         self.observed = nn.GRU(patch, hidden, batch_first=True)
@@ -92,7 +93,7 @@ class RecurrentVAE(nn.Module):
         code = self._code(observed)
         known = torch.cat([code, self.action(action)], dim=1)
         mean, log_variance = self.prior_network(known).chunk(2, dim=1)
-        weight, bias = self.from_request.weight[:, : known.shape[1]], self.from_request.bias
+        weight, bias = self.from_request.weight[:, : 2 * self.hidden], self.from_request.bias
         request = nn.functional.linear(known, weight, bias)
         state = (request, self.first_hidden(code), observed[:, -1], 0.0 * code[:, :1])
         return (mean, log_variance), state
@@ -106,31 +107,37 @@ class RecurrentVAE(nn.Module):
     ) -> tuple[Float[Tensor, "B L F"], tuple[Tensor, ...]]:
         """The next frames, and the tensors of ``carried`` after them."""
         request, hidden, latest, steps = state
-        latent = z[:, :-NUM_TIMES]
-        fixed = request + nn.functional.linear(
-            latent, self.from_request.weight[:, -latent.shape[1] :]
-        )
-        patches = []
-        for start in range(0, num_frames, self.frames_per_step):
-            clock = self.from_clock(self.clock(steps, z[:, -NUM_TIMES:]))
-            hidden = self._cell(fixed + clock + self.from_frame(latest), hidden)
-            steps = steps + 1.0
-            patch = self.output(hidden).unflatten(1, (self.frames_per_step, -1)) + latest[:, None]
-            latest = patch[:, -1]
+        size, width = self.frames_per_step, int(latest.shape[1])
+        count = num_frames // size
+        latent, timing = torch.split(z, [self.latent, NUM_TIMES], dim=1)
+        fixed = request + nn.functional.linear(latent, self.from_request.weight[:, -self.latent :])
+        # What does not hang on the frames before is computed for all steps at once.
+        ages = steps + torch.arange(count, dtype=z.dtype, device=z.device)[:, None, None]
+        given = fixed + self.from_clock(self.clock(ages, timing))  # (count, B, 3 H)
+        deep, to_patch = self.output
+        weight, bias = (parameter[-width:] for parameter in to_patch.parameters())
+        before, thoughts = [], []
+        for step, clock in enumerate(given.unbind()):
+            before.append(latest)
+            hidden = self._cell(clock + self.from_frame(latest), hidden)
+            thoughts.append(deep(hidden))
+            latest = latest + nn.functional.linear(thoughts[-1], weight, bias)
             if told is not None:
-                last = start + self.frames_per_step - 1
+                last = (step + 1) * size - 1
                 latest = torch.where(told.here[:, last, None], told.future[:, last], latest)
-            patches.append(patch)
-        return torch.cat(patches, dim=1), (hidden, latest, steps)
+        changes = to_patch(torch.stack(thoughts, dim=1)).reshape(-1, count, size, width)
+        frames = changes + torch.cat(before, dim=1).reshape(-1, count, 1, width)
+        return frames.reshape(-1, num_frames, width), (hidden, latest, steps + count)
 
     def _cell(
         self, given: Float[Tensor, "B G"], hidden: Float[Tensor, "B H"]
     ) -> Float[Tensor, "B H"]:
         """A gated recurrent unit whose input was multiplied beforehand where it stays the same."""
-        reset, update, new = given.chunk(3, dim=1)
-        own_reset, own_update, own_new = self.from_hidden(hidden).chunk(3, dim=1)
-        update = torch.sigmoid(update + own_update)
-        candidate = torch.tanh(new + torch.sigmoid(reset + own_reset) * own_new)
+        sizes = [2 * self.hidden, self.hidden]
+        gates, new = torch.split(given, sizes, dim=1)
+        own_gates, own_new = torch.split(self.from_hidden(hidden), sizes, dim=1)
+        reset, update = torch.split(torch.sigmoid(gates + own_gates), self.hidden, dim=1)
+        candidate = torch.tanh(new + reset * own_new)
         return candidate + update * (hidden - candidate)
 
     def _code(self, observed: Float[Tensor, "B T F"]) -> Float[Tensor, "B H"]:

@@ -46,21 +46,24 @@ class Clock(nn.Module):
         self.register_buffer("rates", rates, persistent=False)
 
     def forward(
-        self, age: Float[Tensor, "*B 1"], timing: Float[Tensor, "*B 4"]
+        self, age: Float[Tensor, "*B 1"], timing: Float[Tensor, "*#B 4"]
     ) -> Float[Tensor, "*B C"]:
         """Features of steps of an age; frequency and phase may be any numbers."""
-        log_length, log_frequency, cos, sin = timing.split(1, dim=-1)
+        log_length, log_frequency, cos, sin = torch.split(timing, 1, dim=-1)
         left = LENGTH_UNIT / self.frames_per_step * log_length.exp() - age
-        angles = torch.cat([age * self.rates, left.clamp(min=LEFT_AT_REST) * self.rates], dim=-1)
         slowest, fastest = (math.log(PERIOD_UNIT / p) for p in (LONGEST_PERIOD, SHORTEST_PERIOD))
         log_frequency = log_frequency.clamp(slowest, fastest)
         turned = 2 * torch.pi * self.frames_per_step / PERIOD_UNIT * log_frequency.exp() * age
+        angles = [age * self.rates, left.clamp(min=LEFT_AT_REST) * self.rates, turned]
+        sizes = [2 * NUM_RATES, 1]
+        all_angles = torch.cat(angles, dim=-1)
+        sines, turned_sin = torch.split(in_lanes(torch.sin, all_angles), sizes, dim=-1)
+        cosines, turned_cos = torch.split(in_lanes(torch.cos, all_angles), sizes, dim=-1)
         size = (cos.square() + sin.square()).add(1e-8).sqrt()
-        turned_cos, turned_sin = in_lanes(torch.cos, turned), in_lanes(torch.sin, turned)
-        c = (turned_cos * cos - turned_sin * sin) / size
-        s = (turned_sin * cos + turned_cos * sin) / size
-        beat = [c, s, c * c - s * s, 2 * c * s, log_frequency]
-        return torch.cat([angles.sin(), angles.cos(), *beat], dim=-1)
+        cos, sin = cos / size, sin / size
+        c, s = turned_cos * cos - turned_sin * sin, turned_sin * cos + turned_cos * sin
+        beat = [c, s, c * c - s * s, 2 * c * s, log_frequency + 0.0 * age]
+        return torch.cat([sines, cosines, *beat], dim=-1)
 
 
 class Rhythm(nn.Module):
