@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -232,7 +232,9 @@ class Manifest(_Record):
         body = self.model_dump(mode="json", exclude=silent)
         return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()[:16]
 
-    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+    def model_copy(
+        self, *, update: Mapping[str, Any] | None = None, deep: bool = False
+    ) -> "Manifest":
         """A copy with some fields changed, and so with a digest of its own."""
         copied = super().model_copy(update=update, deep=deep)
         vars(copied).pop("digest", None)

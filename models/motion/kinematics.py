@@ -108,9 +108,10 @@ def fit_bone_lengths(
 ) -> Float[np.ndarray, "*batch J 3"]:
     """The poses with given bone lengths: every bone keeps its direction, the root its place.
 
-    A bone of no length takes the direction of the bone above it, or up.
+    A bone of no length takes the direction of the bone above it, or up. In memory the result lies
+    joint by joint.
     """
-    # Joints and axes first in memory: every operation then goes along a row of all poses.
+    # Joints and axes first: every operation then goes along a row of all poses.
     rows = np.ascontiguousarray(np.moveaxis(positions, (-2, -1), (0, 1)))
     result = np.array(rows)
     directions = np.zeros_like(rows)
