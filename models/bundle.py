@@ -10,6 +10,8 @@ import hashlib
 import json
 import shutil
 import tempfile
+from collections.abc import Mapping
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -218,7 +220,7 @@ class Manifest(_Record):
             return num_steps or self.default_steps
         return self.num_steps
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """Short sha256 over the graphs and the tables: two bundles that answer alike share it."""
         silent: dict[str, Any] = dict.fromkeys(("recipe", "training", "description"), True)
@@ -229,6 +231,14 @@ class Manifest(_Record):
             silent["schedule"] = {"plan", "default_steps"}
         body = self.model_dump(mode="json", exclude=silent)
         return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()[:16]
+
+    def model_copy(
+        self, *, update: Mapping[str, Any] | None = None, deep: bool = False
+    ) -> "Manifest":
+        """A copy with some fields changed, and so with a digest of its own."""
+        copied = super().model_copy(update=update, deep=deep)
+        vars(copied).pop("digest", None)
+        return copied
 
 
 def sha256_of(path: Path) -> str:

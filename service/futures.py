@@ -44,9 +44,9 @@ def caller_futures(
     answer = _in_skeleton(paths, last, skeleton, caller)
     if bone_lengths == "observed":
         answer = fit_bone_lengths(answer, caller.bones, caller.bone_parents)
-    in_world = np.asarray(answer + caller.offset)
-    in_world[:, :, caller.fixed] = caller.last_pose[caller.fixed] + caller.offset
-    return in_world
+    answer += caller.offset
+    answer[:, :, caller.fixed] = caller.last_pose[caller.fixed] + caller.offset
+    return answer
 
 
 def written(
@@ -56,12 +56,15 @@ def written(
 
     They are float32 where that keeps 0.1 mm, as in a room, and float64 far from the origin.
     """
-    ordered = np.empty_like(futures)
-    ordered[:, :, list(caller.order)] = futures
     units = UNITS_PER_METRE[caller.axes.units]
-    rounded = np.round(caller.axes.from_metres(ordered), DECIMALS - round(np.log10(units)))
-    spacing = float(np.spacing(np.float32(np.abs(rounded).max()))) / units
-    return rounded.astype(np.float32) if spacing < 0.5 * 10**-DECIMALS else rounded
+    rounded = caller.axes.from_metres(futures)
+    np.round(rounded, DECIMALS - round(np.log10(units)), out=rounded)
+    spacing = float(np.spacing(np.float32(max(rounded.max(), -rounded.min())))) / units
+    dtype = np.float32 if spacing < 0.5 * 10**-DECIMALS else np.float64
+    ordered = np.empty(rounded.shape, dtype)
+    for joint, place in enumerate(caller.order):
+        ordered[:, :, place] = rounded[:, :, joint]
+    return ordered
 
 
 def caller_segments(

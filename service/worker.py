@@ -3,7 +3,7 @@
 import asyncio
 import logging
 from collections import deque
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Sequence
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from time import perf_counter
 from types import TracebackType
 from typing import Literal, NoReturn, Protocol, TypeAlias, runtime_checkable
 
-from service.engine.engine import Engine, Turn
+from service.engine.engine import Engine, Event, Turn
 from service.engine.trajectory import Failure, Preview, Request, Result
 from service.errors import (
     CancelledRequestError,
@@ -26,6 +26,8 @@ from service.errors import (
 _log = logging.getLogger(__name__)
 
 MAX_UNREAD_BYTES = 1 << 20
+WRITERS = 1
+"""So many threads more than compute, so that one can write while all of those do."""
 
 Outcome: TypeAlias = Literal["finished", "failed", "cancelled", "refused"]
 
@@ -87,6 +89,8 @@ class _Job:
 class Worker:
     """Runs the requests of many callers on one engine, by several threads, until it is stopped.
 
+    So many ``threads`` compute at a time. One that has something to write lets another compute
+    meanwhile: neither does a turn wait for an answer, nor a core for who writes one.
     At most ``max_rows`` of theirs are under way; where none is, one request of any size. How many
     requests there may be is up to the guard, who counts them before they are read.
     """
@@ -100,16 +104,20 @@ class Worker:
         observer: Observer | None = None,
     ) -> None:
         self._engine = engine
+        self._shares = threads
+        self._num_computing = 0
         self._max_rows = max_rows
         self._observer = observer
         self._jobs: dict[int, _Job] = {}
-        # Guards the jobs and the two flags; told of rows that wait, and of jobs that have ended.
+        # Guards the jobs, the two flags and who computes; told of rows that wait, of threads that
+        # no longer compute, and of jobs that have ended.
         self._changed = Condition()
         self._closed = False
         self._stopped = False
         name = f"engine-{engine.manifest.name}"
         self._threads = [
-            Thread(target=self._drive, name=f"{name}-{i}", daemon=True) for i in range(threads)
+            Thread(target=self._drive, name=f"{name}-{i}", daemon=True)
+            for i in range(threads + WRITERS)
         ]
         for thread in self._threads:
             thread.start()
@@ -170,6 +178,10 @@ class Worker:
         request_id = self._add(job)
         return _Stream(job, news, leave=lambda: self._cancel(request_id))
 
+    def sent(self, seconds: float) -> None:
+        """Learn how long an answer took on its way out, from who waited for it to the network."""
+        self._engine.costs.learn("send", 1, seconds)
+
     def cancel(self, request_key: str) -> bool:
         """End what is under way by this key with a CancelledRequestError; False if nothing is."""
         with self._changed:
@@ -186,9 +198,7 @@ class Worker:
 
     def seconds_until_free(self, *, requests: int = 1, rows: int = 1) -> float:
         """When so many requests, with so many rows, will probably have ended."""
-        return self._engine.seconds_until_free(
-            requests=requests, rows=rows, shares=len(self._threads)
-        )
+        return self._engine.seconds_until_free(requests=requests, rows=rows, shares=self._shares)
 
     async def drain(self, within_s: float) -> None:
         """Take no more; after this time let what is under way end with what it has; then stop."""
@@ -262,28 +272,44 @@ class Worker:
     def _drive(self) -> None:
         while self._has_work():
             try:
-                self._turn()
+                self._write(self._computed())
             except Exception:  # noqa: BLE001 - the outermost loop: the thread must live
                 # Nobody can say whose fault it was, so everything under way fails.
                 _log.exception("the engine failed")
                 self._fail_all(_unforeseen)
 
     def _has_work(self) -> bool:
-        """Wait until there is a row to run; False once the worker is stopped."""
+        """Wait until there is a row to run, and a thread too few; False once it is stopped."""
         with self._changed:
-            self._changed.wait_for(lambda: self._stopped or self._engine.num_waiting > 0)
+            self._changed.wait_for(
+                lambda: (
+                    self._stopped
+                    or (self._engine.num_waiting > 0 and self._num_computing < self._shares)
+                )
+            )
+            self._num_computing += 1
             return not self._stopped
 
-    def _turn(self) -> None:
-        started_s = perf_counter()
-        turn = self._engine.turn(shares=len(self._threads))
+    def _computed(self) -> list[Event]:
+        """What comes of a turn, which has been this thread's to compute."""
+        started_s, writes = perf_counter(), True
+        try:
+            turn = self._engine.turn(shares=self._shares)
+            writes = bool(turn.events)
+        finally:
+            with self._changed:
+                self._num_computing -= 1
+                # Who has nothing to write computes on: to wake another for that would be in vain.
+                if self._engine.num_waiting and self._num_computing + (not writes) < self._shares:
+                    self._changed.notify_all()
         if self._observer is not None and turn.num_rows:
             self._observer.stepped(
                 model=self._engine.manifest.name, turn=turn, seconds=perf_counter() - started_s
             )
-        with self._changed:
-            self._changed.notify_all()
-        for event in turn.events:
+        return turn.events
+
+    def _write(self, events: Sequence[Event]) -> None:
+        for event in events:
             if isinstance(event, Preview):
                 self._show(event)
             else:

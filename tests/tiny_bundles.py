@@ -292,4 +292,5 @@ def walking(num_frames: int = NUM_OBSERVED, *, fps: float = FPS, speed: float = 
         reach = {"left": 0.25, "right": -0.25}.get(name.split("_")[0], 0.0)
         depth = np.clip(0.96 - standing_pose()[joint, 2], 0.0, 1.0)
         poses[:, joint, 0] += reach * depth * np.sin(2 * np.pi * times)
-    return fit_bone_lengths(poses, bone_lengths(standing_pose(), BODY21.parents), BODY21.parents)
+    lengths = bone_lengths(standing_pose(), BODY21.parents)
+    return np.ascontiguousarray(fit_bone_lengths(poses, lengths, BODY21.parents))

@@ -33,14 +33,26 @@ class Axes:
 
     def to_metres(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Points in these axes as metres, +Z up, right-handed."""
-        return np.asarray((points / UNITS_PER_METRE[self.units]) @ self._matrix().T)
+        in_metres = points / UNITS_PER_METRE[self.units]
+        return _turned(in_metres, self._matrix())
 
     def from_metres(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Points in metres, +Z up, right-handed, in these axes."""
-        return np.asarray(points @ self._matrix() * UNITS_PER_METRE[self.units])
+        return _turned(points, self._matrix().T * UNITS_PER_METRE[self.units])
 
     def _matrix(self) -> Float[np.ndarray, "3 3"]:
         matrix = np.array(_TO_Z_UP[self.up], dtype=np.float64)
         if self.handed == "left":  # a left-handed world is a right-handed one seen in a mirror
             matrix[1] *= -1.0
         return matrix
+
+
+def _turned(
+    points: Float[np.ndarray, "*batch 3"], matrix: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "*batch 3"]:
+    """Points times a matrix that has one number in each row, as they lie in memory."""
+    turned = np.empty_like(points, dtype=np.float64)
+    for axis, row in enumerate(matrix):
+        source = int(np.flatnonzero(row)[0])
+        np.multiply(points[..., source], row[source], out=turned[..., axis])
+    return turned

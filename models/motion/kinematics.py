@@ -108,7 +108,8 @@ def fit_bone_lengths(
 ) -> Float[np.ndarray, "*batch J 3"]:
     """The poses with given bone lengths: every bone keeps its direction, the root its place.
 
-    A bone of no length takes the direction of the bone above it, or up.
+    A bone of no length takes the direction of the bone above it, or up. In memory the result lies
+    joint by joint.
     """
     # Joints and axes first: every operation then goes along a row of all poses.
     rows = np.ascontiguousarray(np.moveaxis(positions, (-2, -1), (0, 1)))
@@ -120,10 +121,13 @@ def fit_bone_lengths(
             continue
         bone = rows[j] - rows[parent]
         length = np.sqrt(bone[0] ** 2 + bone[1] ** 2 + bone[2] ** 2)
-        unit = bone / np.maximum(length, 1e-9)
-        directions[j] = np.where(length > 1e-9, unit, directions[parent])
-        result[j] = result[parent] + directions[j] * lengths[j]
-    return np.ascontiguousarray(np.moveaxis(result, (0, 1), (-2, -1)))
+        np.divide(bone, np.maximum(length, 1e-9), out=directions[j])
+        none = length <= 1e-9
+        if none.any():
+            directions[j][:, none] = directions[parent][:, none]
+        np.multiply(directions[j], lengths[j], out=result[j])
+        result[j] += result[parent]
+    return np.moveaxis(result, (0, 1), (-2, -1))
 
 
 def yaw(

@@ -110,7 +110,7 @@ class Answer:
         futures = (
             self._lasting(in_world, self._caller_segments(preview.segments))
             if self._performs
-            else np.ascontiguousarray(written(in_world, self.observation.caller))
+            else written(in_world, self.observation.caller)
         )
         steps = {"run": preview.steps_run, "of": preview.steps_of}
         content = {"id": self.id, "steps": steps, "futures": futures}
@@ -148,8 +148,7 @@ class Answer:
     def _continued(self, in_world: Float[np.ndarray, "N H J 3"], result: Result) -> dict[str, Any]:
         content: dict[str, Any] = {"num_frames": in_world.shape[1]}
         if "futures" in self.returned:
-            futures = written(in_world, self.observation.caller)
-            content["futures"] = np.ascontiguousarray(futures)
+            content["futures"] = written(in_world, self.observation.caller)
         if "modes" in self.returned:
             content["modes"] = [
                 {
@@ -177,7 +176,7 @@ class Answer:
         decimals = DECIMALS - round(np.log10(units))
         return {
             "levels": list(found.levels),
-            "centre": np.ascontiguousarray(written(found.centre[None], caller)[0]),
+            "centre": written(found.centre[None], caller)[0],
             "radius": np.round(radius * units, decimals).astype(np.float32),
             "calibrated": found.calibrated,
         }
@@ -229,7 +228,7 @@ class Answer:
         return [
             {
                 "num_frames": parts[-1].end,
-                "poses": np.ascontiguousarray(future[: parts[-1].end]),
+                "poses": future[: parts[-1].end],
                 "segments": [
                     {
                         "action": labels[part.action],

@@ -214,7 +214,8 @@ class Engine:
         for request_id, job, waiting, is_begun in self._hasty():
             step = {"encode": sum(map(len, unencoded(rows.context for rows in waiting)))}
             left = job.num_rows - job.num_whole
-            last = {"decode": left, "answer": job.request.num_samples, "deliver": THERE_AND_BACK}
+            last = {"decode": left, "answer": job.request.num_samples}
+            last |= {"deliver": THERE_AND_BACK, "send": THERE_AND_BACK}
             # Rows that another thread has come back a step later.
             elsewhere = size if left > sum(map(len, waiting)) else 0
             left_s = job.deadline_s - now_s - ahead_s - self.costs.expected(step=elsewhere)

@@ -100,14 +100,16 @@ class Scheduler(Generic[RowsT]):
             return (queue.deadline_s if tight else math.inf, queue.work)
 
         total = self.num_next(shares=shares)
-        counts: dict[_Queue[RowsT], int] = {}
         left = total - (max(1, total // GOES_ROUND) if total > 1 else 0)
         waiting = sorted((q for q in self._queues.values() if q.num_waiting), key=order)
+        counts = dict.fromkeys(waiting, 0)
         for queue in waiting:
+            if not left:
+                break
             counts[queue] = min(left, queue.num_waiting)
             left -= counts[queue]
         self._share(counts, total - sum(counts.values()))
-        taken = [rows for queue, count in counts.items() for rows in queue.popped(count)]
+        taken = [rows for queue, count in counts.items() if count for rows in queue.popped(count)]
         self.num_waiting -= total
         self.num_running += total
         return taken
@@ -159,6 +161,8 @@ class Scheduler(Generic[RowsT]):
 
     def _share(self, counts: dict[_Queue[RowsT], int], left: int) -> None:
         for queue in sorted(counts, key=lambda queue: (counts[queue] > 0, queue.last_share)):
+            if not left:
+                break
             count = min(left, queue.num_waiting - counts[queue])
             if count:
                 counts[queue] += count

@@ -6,6 +6,7 @@ from time import perf_counter
 
 import orjson
 from fastapi import Request, Response
+from starlette.background import BackgroundTask
 
 from service.answers.answer import Answer
 from service.engine import trajectory
@@ -50,14 +51,21 @@ async def replied(
 
     if answer.media_type in STREAMS:
         return await _streamed(http, worker, request, answer, ended)
-    work = worker.predict(request, answer.final, request_key=answer.id)
-    content = await unless_gone(http, work)
+
+    async def answered() -> tuple[bytes, float]:
+        return await worker.predict(request, answer.final, request_key=answer.id), perf_counter()
+
+    async def sent() -> None:
+        worker.sent(perf_counter() - answered_s)
+
+    content, answered_s = await unless_gone(http, answered())
     ended()
     headers = {"Content-Type": answer.media_type}
     if answer.media_type in MOTIONS:
         content, headers = await asyncio.to_thread(answer.files)
     timing = ", ".join(f"{name};dur={ms}" for name, ms in answer.milliseconds().items())
-    return Response(content, headers=headers | {"Server-Timing": timing})
+    headers |= {"Server-Timing": timing}
+    return Response(content, headers=headers, background=BackgroundTask(sent))
 
 
 async def _streamed(

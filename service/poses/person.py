@@ -35,12 +35,13 @@ def check_person(world: Float[np.ndarray, "T J 3"], *, order: Sequence[int], uni
         order=order,
         what="from the origin of the world",
     )
-    frames = world[seen.any(axis=1)]
-    low, high = np.nanmin(frames, axis=1), np.nanmax(frames, axis=1)
-    _check_size(float(np.median(np.linalg.norm(high - low, axis=-1))), units)
-    middle = np.zeros((len(world), 1, 3))
-    middle[seen.any(axis=1), 0] = np.nanmedian(frames, axis=1)
-    reach = np.where(seen, np.linalg.norm(points - middle, axis=-1), 0.0)
+    counts = seen.sum(axis=1)
+    rows, last = np.arange(len(world)), np.maximum(counts, 1) - 1
+    ranked = np.sort(world, axis=1)  # NaN comes last
+    size = np.linalg.norm(ranked[rows, last] - ranked[:, 0], axis=-1)
+    _check_size(float(np.median(size[counts > 0])), units)
+    middle = (ranked[rows, last // 2] + ranked[rows, (last + 1) // 2]) / 2.0
+    reach = np.where(seen, np.linalg.norm(points - middle[:, None], axis=-1), 0.0)
     _refuse_where(reach, limit=MAX_REACH_M, order=order, what="from the middle of the body")
 
 

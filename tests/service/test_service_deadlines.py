@@ -72,6 +72,15 @@ def test_answer_is_the_best_that_is_ready_in_time(bundles: Path, seconds: float,
     assert result.futures.tobytes() == fewer.futures.tobytes()
 
 
+@pytest.mark.parametrize("role", ["deliver", "send"])
+def test_the_way_there_and_back_is_left_for_an_answer(bundles: Path, role: str):
+    engine, runner = knowing(bundles / "diffusion")
+    for _ in range(50):
+        engine.costs.learn(role, 1, 1.0)
+    result = predict(engine, request(deadline_s=runner.now_s + 7.8))
+    assert result.steps_run == 5
+
+
 def test_asked_steps_that_fit_are_not_the_deadlines_doing(bundles: Path):
     engine, runner = knowing(bundles / "diffusion")
     result = predict(engine, request(deadline_s=runner.now_s + 9.0, num_steps=3))

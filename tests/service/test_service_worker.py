@@ -3,8 +3,8 @@ from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator, Seque
 from contextlib import aclosing
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
-from time import perf_counter
+from threading import Event, Lock
+from time import perf_counter, sleep
 from typing import Any
 
 import numpy as np
@@ -143,6 +143,55 @@ def test_answers_many_callers_at_once(
     assert recorder.outcomes == ["finished"] * 20
     assert {facts["steps_run"] for facts in recorder.ends} == {NUM_STEPS}
     assert sum(recorder.rows) == 20 * 2 * NUM_STEPS
+
+
+def test_another_request_is_computed_while_an_answer_is_written(start: Callable[..., Worker]):
+    worker, writes, may_write = start(threads=1), asyncio.Event(), Event()
+
+    async def both() -> tuple[bytes, bytes]:
+        loop = asyncio.get_running_loop()
+
+        def held(result: Result, timing: Timing) -> bytes:
+            loop.call_soon_threadsafe(writes.set)
+            assert may_write.wait(30.0)
+            return answer(result, timing)
+
+        first = asyncio.ensure_future(worker.predict(WALK, held))
+        await writes.wait()
+        try:
+            second = await asyncio.wait_for(worker.predict(WALK, answer), 30.0)
+        finally:
+            may_write.set()
+        return await first, second
+
+    first, second = run(both())
+    assert first == second
+
+
+def test_no_more_threads_compute_than_may(start: Callable[..., Worker], runner: HeldRunner):
+    computing: list[int] = []
+    now, lock, computed = 0, Lock(), runner.run
+
+    def counted(*args: Any) -> Tensors:
+        nonlocal now
+        with lock:
+            now += 1
+            computing.append(now)
+        sleep(0.001)
+        try:
+            return computed(*args)
+        finally:
+            with lock:
+                now -= 1
+
+    runner.run = counted  # type: ignore[method-assign]
+    worker = start(threads=2, rows_per_step=8)
+
+    async def together() -> None:
+        await asyncio.gather(*(worker.predict(WALK, answer) for _ in range(20)))
+
+    run(together())
+    assert max(computing) == 2
 
 
 def test_timing_is_within_the_time_that_passed(start: Callable[..., Worker]):
