@@ -164,6 +164,14 @@ async def _closed(port: int, groups: Sequence[Group], until_s: float) -> list[li
     return await asyncio.gather(*(together(group) for group in groups))
 
 
+def _still_open(idle: list[_Connection]) -> _Connection | None:
+    """One that the server has not closed meanwhile; those that it has are forgotten."""
+    while idle:
+        if not (connection := idle.pop()).transport.is_closing():
+            return connection
+    return None
+
+
 async def _opened(port: int, asked: bytes, *, per_s: float, seconds: float) -> list[Reply]:
     idle: list[_Connection] = []
     replies: list[Reply] = []
@@ -171,7 +179,7 @@ async def _opened(port: int, asked: bytes, *, per_s: float, seconds: float) -> l
     async def ask() -> None:
         sent_s = time.perf_counter()
         try:
-            connection = idle.pop() if idle else await _Connection.to(port)
+            connection = _still_open(idle) or await _Connection.to(port)
             replies.append(await connection.reply(asked))
             idle.append(connection)
         except OSError:
