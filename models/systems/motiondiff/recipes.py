@@ -162,7 +162,7 @@ def mocap_diffusion_longer() -> Recipe:
 
 
 def mocap_refinement_held_out() -> Recipe:
-    """`mocap_held_out` in two runs: a finished `mocap_diffusion_held_out` gets its refinement."""
+    """The last of several runs: a finished `mocap_diffusion_longer` gets its refinement."""
     recipe = mocap_held_out()
     return dataclasses.replace(recipe, name="mocap_refinement_held_out", stages=recipe.stages[1:])
 
