@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -26,19 +25,13 @@ def body_of(positions: Float[np.ndarray, "T J 3"], skeleton: Skeleton) -> Body:
     Raises:
         SkeletonError: A required joint of body21 is missing.
     """
-    return {joint: row @ positions[:, used] for joint, row, used in _told_by(skeleton)}
-
-
-@lru_cache(maxsize=256)
-def _told_by(skeleton: Skeleton) -> tuple[tuple[str, np.ndarray, np.ndarray], ...]:
-    """Each joint of body21 that can be told, the weights that tell it, and of which joints."""
     weights, known = joint_map(skeleton, BODY21)
-    return tuple(
-        (joint, row[used], used)
-        for row, joint, is_known in zip(weights, BODY21.joints, known, strict=True)
-        for used in [np.flatnonzero(row)]
-        if is_known
-    )
+    paths: dict[str, np.ndarray] = {}
+    for row, joint, is_known in zip(weights, BODY21.joints, known, strict=True):
+        used = np.flatnonzero(row)
+        if is_known:
+            paths[joint] = row[used] @ positions[:, used]
+    return paths
 
 
 def guess_up(body: Body) -> Up:

@@ -150,7 +150,7 @@ def test_stream_of_actions_that_breaks_off_looks_like_none_that_is_whole(
         until(lambda: live.under_way() == 1)
         connection.close()
         until(lambda: live.under_way() == 0)
-        assert live.app.state.streams == set()
+        until(lambda: live.app.state.streams == set())
 
 
 def test_drawn_seed_is_told_before_the_first_preview(service: Service):

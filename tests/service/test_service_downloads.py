@@ -1,6 +1,7 @@
 import io
 import zipfile
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import httpx
@@ -14,7 +15,9 @@ from tiny_bundles import walking
 from models.motion.axes import Axes
 from models.motion.formats.bvh import read_bvh
 from models.motion.skeleton import BODY21
+from service.answers.answer import Answer
 from service.media import BVH, GLB
+from service.worker import Worker
 
 WALK = walking()
 OPTIONS = {"seed": 3, "num_samples": 1}
@@ -42,6 +45,28 @@ def test_one_future_is_a_bvh_of_the_same_positions(service: Service, tmp_path: P
     assert np.linalg.norm(found - expected, axis=-1).max() < 1e-3
     inner = response.text.count("CHANNELS 6") - 1
     assert inner == 0 if lengths == "observed" else inner > 0
+
+
+def test_way_out_of_an_answer_begins_when_its_files_are_made(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+):
+    made_s: list[float] = []
+    since_made_s: list[tuple[float, float]] = []
+    files = Answer.files
+
+    def timed(answer: Answer) -> tuple[bytes, dict[str, str]]:
+        made = files(answer)
+        made_s.append(perf_counter())
+        return made
+
+    def sent(_: Worker, seconds: float) -> None:
+        since_made_s.append((seconds, perf_counter() - made_s[0]))
+
+    monkeypatch.setattr(Answer, "files", timed)
+    monkeypatch.setattr(Worker, "sent", sent)
+    assert asked(service, BVH).status_code == 200
+    [(seconds, since_s)] = since_made_s
+    assert seconds <= since_s
 
 
 def test_file_is_upright_and_in_metres_whatever_the_caller_uses(service: Service, tmp_path: Path):

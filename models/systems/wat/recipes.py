@@ -404,6 +404,7 @@ def _recipe(
     latent: int,
     spread: float,
 ) -> Recipe:
+    size_of_z = latent + NUM_TIMES
     return Recipe(
         name=name,
         system="wat",
@@ -412,13 +413,13 @@ def _recipe(
         build=build,
         graphs=partial(
             graphs,
-            size_of_z=latent + NUM_TIMES,
+            size_of_z=size_of_z,
             chunk_frames=_actions(data).chunk_frames,
             horizon=data.horizon,
             spread=spread,
         ),
         stages=(stage,),
-        x_t_shape=(latent + NUM_TIMES,),
+        x_t_shape=(size_of_z,),
     )
 
 
