@@ -62,8 +62,8 @@ Every history is continued with every action; real: the held-out clips themselve
 observations with their futures the classifier takes for the action asked for. FID of its features
 to those of real clips, all actions alike. Div, Div_w, ADE and ADE_w in metres, a pose as one
 vector, relative to the root without it; Div holds the last pose to the longest future, _w is after
-dynamic time warping; real Div_w is among clips of one action, predicted among futures of one
-history. ADE where the action is the history's own, best of the samples. Cut off: not stopped by
+dynamic time warping; real Div_w is among clips of one action and style, predicted among futures of
+one history. ADE where the action is the history's own, best of the samples. Cut off: not stopped by
 itself at the longest. Length: the mean of an action that the history has begun already beside that
 of the held-out clips, mean and worst action; frames are those after any history, most of which
 have to get into the action first. Velocity change at the first predicted frame: times the real one,

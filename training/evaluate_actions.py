@@ -198,8 +198,11 @@ def _reality(
 
 
 def _performed(actions: Sequence[_RealAction]) -> Iterator[Performance]:
-    for label in sorted({action.label for action in actions}):
-        mine = [action for action in actions if action.label == label]
+    """Of every action and style: a history shows its style, and a person keeps it."""
+    groups: dict[tuple[int, str], list[_RealAction]] = {}
+    for action in actions:
+        groups.setdefault((action.label, action.clip.style), []).append(action)
+    for (label, _), mine in groups.items():
         yield Performance(
             label=label,
             histories=np.stack([action.observation for action in mine]),

@@ -17,13 +17,19 @@ FRAMES_AT_REST = 20
 class Encoder(nn.Module):
     """All that the chunks of an action need of observation and label.
 
-    ``spread`` times the prior's deviation is that of z, timing apart.
+    So many times the prior's deviation is z's: the first of the ``spreads``, the second for the
+    length, 1 for frequency and phase.
     """
 
-    def __init__(self, network: WAT, *, spread: float) -> None:
+    factors: Tensor
+
+    def __init__(self, network: WAT, *, size_of_z: int, spreads: tuple[float, float]) -> None:
         super().__init__()
         self.network = network
-        self.spread = spread
+        factors = torch.full((size_of_z,), spreads[0])
+        factors[-NUM_TIMES] = spreads[1]
+        factors[-NUM_TIMES + 1 :] = 1.0
+        self.register_buffer("factors", factors)
 
     def forward(
         self, observation: Float[Tensor, "B T J 3"], action: Int[Tensor, "B"]
@@ -34,9 +40,7 @@ class Encoder(nn.Module):
         origin, ground = poses.standing(observation)
         (mean, log_variance), own = self.network.begin(observed, action)
         beginning = 1.0 + 0.0 * mean[:, :1]  # ones_like would fix the batch's size
-        deviation = (0.5 * log_variance).exp()
-        narrowed = self.spread * deviation[:, :-NUM_TIMES]
-        deviation = torch.cat([narrowed, deviation[:, -NUM_TIMES:]], dim=1)
+        deviation = self.factors * (0.5 * log_variance).exp()
         arms, bound_for = poses.articulation.arms(bones), self.network.bound_for(observed)
         return mean, deviation, arms, bound_for, origin, beginning, ground, *own
 
@@ -76,7 +80,12 @@ class Decoder(nn.Module):
 
 
 def graphs(
-    network: WAT, *, size_of_z: int, chunk_frames: int, horizon: int, spread: float
+    network: WAT,
+    *,
+    size_of_z: int,
+    chunk_frames: int,
+    horizon: int,
+    spreads: tuple[float, float],
 ) -> tuple[Graph, ...]:
     """Encoder and decoder of a trained network."""
     kept, carried = network.form.kept, network.form.carried
@@ -84,7 +93,7 @@ def graphs(
     return (
         Graph(
             role="encoder",
-            module=Encoder(network, spread=spread),
+            module=Encoder(network, size_of_z=size_of_z, spreads=spreads),
             inputs=("observation", "action"),
             outputs=(*given, *kept, *carried),
         ),

@@ -335,7 +335,9 @@ def _mocap_recurrent(name: str, data: Data) -> Recipe:
         "widths": (300, 200),
         "frames_per_step": FRAMES_PER_STEP,
     }
-    return _recurrent(name, data, sizes=sizes, stage=_stage(data, num_updates=5_000), spread=1.1)
+    return _recurrent(
+        name, data, sizes=sizes, stage=_stage(data, num_updates=5_000), spreads=(0.3, 0.5)
+    )
 
 
 def _mocap_transformer(name: str, data: Data) -> Recipe:
@@ -347,7 +349,7 @@ def _mocap_transformer(name: str, data: Data) -> Recipe:
         "frames_per_step": FRAMES_PER_STEP,
     }
     stage = _stage(data, num_updates=5_000, rate=5e-4)
-    return _transformer(name, data, sizes=sizes, stage=stage, spread=0.8)
+    return _transformer(name, data, sizes=sizes, stage=stage, spreads=(0.2, 0.5))
 
 
 def _paper_recurrent(
@@ -379,20 +381,30 @@ def _paper_transformer(
 
 
 def _recurrent(
-    name: str, data: Data, *, sizes: dict[str, Any], stage: Stage, spread: float = 1.0
+    name: str,
+    data: Data,
+    *,
+    sizes: dict[str, Any],
+    stage: Stage,
+    spreads: tuple[float, float] = (1.0, 1.0),
 ) -> Recipe:
     build = partial(build_recurrent, data=data, **sizes)
-    return _recipe(name, data, build, stage, latent=sizes["latent"], spread=spread)
+    return _recipe(name, data, build, stage, latent=sizes["latent"], spreads=spreads)
 
 
 def _transformer(
-    name: str, data: Data, *, sizes: dict[str, Any], stage: Stage, spread: float = 1.0
+    name: str,
+    data: Data,
+    *,
+    sizes: dict[str, Any],
+    stage: Stage,
+    spreads: tuple[float, float] = (1.0, 1.0),
 ) -> Recipe:
     # Its decoder needs no recursion: one chunk is the whole of an action.
     actions = dataclasses.replace(_actions(data), chunk_frames=data.horizon)
     data = dataclasses.replace(data, actions=actions)
     build = partial(build_transformer, data=data, **sizes)
-    return _recipe(name, data, build, stage, latent=sizes["width"], spread=spread)
+    return _recipe(name, data, build, stage, latent=sizes["width"], spreads=spreads)
 
 
 def _recipe(
@@ -402,7 +414,7 @@ def _recipe(
     stage: Stage,
     *,
     latent: int,
-    spread: float,
+    spreads: tuple[float, float],
 ) -> Recipe:
     size_of_z = latent + NUM_TIMES
     return Recipe(
@@ -416,7 +428,7 @@ def _recipe(
             size_of_z=size_of_z,
             chunk_frames=_actions(data).chunk_frames,
             horizon=data.horizon,
-            spread=spread,
+            spreads=spreads,
         ),
         stages=(stage,),
         x_t_shape=(size_of_z,),
