@@ -69,7 +69,7 @@ def main(
     found, peak_mb, start_s = measured(rounds, singles=singles, seconds=seconds)
     manifest = read_manifest(BUNDLES / BUNDLE)
     rows = table(found, peak_mb=peak_mb, start_s=start_s)
-    performed = actions.table(BUNDLES / "wat", rounds=1 if quick else 7, cores=cores)
+    performed = actions.table(BUNDLES / "wat", rounds=1 if quick else 25, cores=cores)
     machine = f"{cores} cores of {processor()}, {datetime.now(UTC):%Y-%m-%d}"
     text = "\n".join(
         [

@@ -301,7 +301,9 @@ def test_candidate_nearest_to_the_real_motion_learns():
     right = torch.tensor([4, 1])
     chosen = network.from_eigenbasis(x_t[:, torch.arange(2), right])
     target = network.motion(network.denoiser(chosen, timestep, condition), start)
-    found = objective._nearest(network, x_t, timestep, condition, start, target)
+    found = objective._nearest(
+        network, x_t, timestep, condition, start, target, torch.ones_like(target[0, 0])
+    )
     torch.testing.assert_close(found, right)
 
 

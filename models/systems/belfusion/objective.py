@@ -160,8 +160,12 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     num_candidates: int,
     reconstruction_weight: float,
     noisiest_share: float = 0.0,
+    root_weight: float = 1.0,
 ) -> Losses:
     """Eq. 6: of k candidates, the one nearest in latents and the one nearest in motion learn.
+
+    In motion the first three features, the root's where a representation has it, count root_weight
+    times what they count in the representation.
 
     All k candidates are first judged without gradients and in bfloat16; the two winners of each
     row are then run again, which gives the gradient of the plain loss at a fraction of its cost.
@@ -172,6 +176,9 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
         z = network.latent_range(network.behaviour_encoder(target, future)[0])
         code = network.coupler.encode_target(target)
         wanted = network.coupler.offsets(network.latent_range.inverse(z), code)
+        counts = torch.ones_like(future[0, 0])
+        counts[:3] = root_weight
+        counts = counts.repeat(wanted.shape[1] // len(counts))
     timestep = torch.randint(schedule.num_steps, (rows,), generator=generator, device=device)
     timestep[: round(noisiest_share * rows)] = schedule.num_steps - 1
     alpha_bar = torch.as_tensor(schedule.alpha_bar, dtype=z.dtype, device=device)[timestep]
@@ -185,13 +192,17 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     )
     condition = network.denoiser.condition(network.context(observation))
     with torch.no_grad(), torch.autocast(device.type, dtype=torch.bfloat16):
-        near_latent, near_motion = _winners(network, x_t, (timestep, condition, code), (z, wanted))
+        near_latent, near_motion = _winners(
+            network, x_t, (timestep, condition, code), (z, wanted, counts)
+        )
     row = torch.arange(rows, device=device)
     chosen = torch.cat([x_t[row, near_latent], x_t[row, near_motion]])
     x0 = network.denoiser(chosen, timestep.repeat(2), condition.repeat(2, 1))
     latent = (x0[:rows] - z).abs().sum(dim=1).mean()
     motion = network.coupler.offsets(network.latent_range.inverse(x0[rows:]), code)
-    reconstruction = (motion - wanted).square().flatten(1).sum(dim=1).add(1e-8).sqrt().mean()
+    reconstruction = (
+        ((motion - wanted) * counts).square().flatten(1).sum(dim=1).add(1e-8).sqrt().mean()
+    )
     return {
         "total": latent + reconstruction_weight * reconstruction,
         "latent": latent,
@@ -203,12 +214,12 @@ def _winners(
     network: BeLFusion,
     x_t: Float[Tensor, "B k D"],
     given: tuple[Tensor, Tensor, Tensor],
-    wanted: tuple[Tensor, Tensor],
+    wanted: tuple[Tensor, Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     timestep, condition, code = (value[:, None] for value in given)
     x0 = network.denoiser(x_t, timestep, condition)
     z = network.latent_range.inverse(x0)
     motion = network.coupler.offsets(z, code.expand(-1, x_t.shape[1], -1))
     latent_error = (x0 - wanted[0][:, None]).abs().sum(dim=-1)
-    motion_error = (motion - wanted[1][:, None]).square().sum(dim=-1)
+    motion_error = ((motion - wanted[1][:, None]) * wanted[2]).square().sum(dim=-1)
     return latent_error.argmin(dim=1), motion_error.argmin(dim=1)

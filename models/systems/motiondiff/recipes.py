@@ -155,9 +155,9 @@ def mocap_diffusion_held_out() -> Recipe:
 
 
 def mocap_diffusion_longer() -> Recipe:
-    """A finished `mocap_diffusion_held_out` goes on: what is refined and measured."""
+    """A finished `mocap_diffusion_held_out`, or itself, goes on: what is refined and measured."""
     return goes_on(
-        "mocap_diffusion_longer", mocap_diffusion_held_out(), num_updates=9_000, learning_rate=8e-4
+        "mocap_diffusion_longer", mocap_diffusion_held_out(), num_updates=15_000, learning_rate=7e-4
     )
 
 

@@ -226,8 +226,12 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     weighted_by_signal: bool,
     whitens_directions_alone: bool = False,
     noisiest_share: float = 0.0,
+    root_weight: float = 1.0,
 ) -> Losses:
     """Eq. 12: of k candidates, the one whose motion is nearest to the real one learns.
+
+    In motion the first three coordinates, the root's where nodes have it, count root_weight times
+    what the nodes weigh them.
 
     All candidates are judged without gradients and in bfloat16; the winners are run again. Their
     latents learn by the whitened distance of eq. 11 (of first power), times alpha_bar where
@@ -241,6 +245,8 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
         z = network.to_eigenbasis(network.latent(batch))
         start = network.nodes.start(observation)
         target = network.nodes.target(observation, future)
+        counts = torch.ones_like(target[0, 0])
+        counts[:3] = root_weight
     timestep = torch.randint(schedule.num_steps, (rows,), generator=generator, device=device)
     timestep[: round(noisiest_share * rows)] = schedule.num_steps - 1
     alpha_bar = torch.as_tensor(schedule.alpha_bar, dtype=z.dtype, device=device)[timestep]
@@ -256,7 +262,7 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     )
     condition = network.condition(batch["seen"])
     with torch.no_grad(), torch.autocast(device.type, dtype=torch.bfloat16):
-        near = _nearest(network, x_t, timestep, condition, start, target)
+        near = _nearest(network, x_t, timestep, condition, start, target, counts)
     chosen = x_t[:, torch.arange(rows, device=device), near]
     x0 = network.denoiser(network.from_eigenbasis(chosen), timestep, condition)
     difference = network.to_eigenbasis(x0) - z
@@ -266,7 +272,7 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     losses = {"total": latent, "latent": latent}
     if reconstruction_weight:
         motion = network.motion(x0, start)
-        reconstruction = _distance(network.nodes.weigh(motion - target)).mean()
+        reconstruction = _distance(network.nodes.weigh(motion - target) * counts).mean()
         losses |= {
             "total": latent + reconstruction_weight * reconstruction,
             "reconstruction": reconstruction,
@@ -274,13 +280,14 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     return losses
 
 
-def _nearest(
+def _nearest(  # noqa: PLR0913 - the symbols of the equation
     network: SkeletonDiffusion,
     x_t: Float[Tensor, "N B k L"],
     timestep: Int[Tensor, "B"],
     condition: Float[Tensor, "N B C"],
     start: Float[Tensor, "N B S"],
     target: Float[Tensor, "B H F"],
+    counts: Float[Tensor, "F"],
 ) -> Int[Tensor, "B"]:
     count = x_t.shape[2]
     x0 = network.denoiser(
@@ -291,4 +298,4 @@ def _nearest(
     starts = start.repeat_interleave(count, dim=1)
     motion = network.motion(x0, starts, every=JUDGED_EVERY).unflatten(0, (-1, count))
     wanted = target[:, JUDGED_EVERY - 1 :: JUDGED_EVERY]
-    return _distance(network.nodes.weigh(motion - wanted[:, None])).argmin(dim=1)
+    return _distance(network.nodes.weigh(motion - wanted[:, None]) * counts).argmin(dim=1)
