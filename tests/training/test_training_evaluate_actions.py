@@ -237,6 +237,25 @@ def test_evaluation_of_actions_is_the_same_every_time(
     assert run(0) != run(1)
 
 
+def test_real_clips_are_told_apart_within_their_style_alone(
+    store: Store, judge: Judge, bundle: tuple[Path, Manifest], tmp_path: Path
+):
+    def differing(styles: list[str]) -> set[str]:
+        clips = [
+            dataclasses.replace(clip, style=style)
+            for clip, style in zip(store.clips, styles, strict=True)
+        ]
+        styled = dataclasses.replace(store, clips=tuple(clips))
+        evaluation = evaluate_actions(
+            [bundle], styled, judge, out=tmp_path, num_samples=2, num_histories=2
+        )
+        return {label for label, scores in evaluation.rows[0].by_label.items() if "div_w" in scores}
+
+    assert differing(["calm"] * 9) == set(LABELS)
+    one_of_each = [clip.subject for clip in store.clips]
+    assert differing(one_of_each) == set()
+
+
 def test_what_does_not_fit_is_refused(
     store: Store, judge: Judge, bundle: tuple[Path, Manifest], bundles: Path, tmp_path: Path
 ):
