@@ -219,7 +219,7 @@ def mocap_held_out() -> Recipe:
 
 
 def mocap_longer() -> Recipe:
-    """A finished `mocap_held_out` goes on, latents kept: what is measured on held-out clips."""
+    """A finished `mocap_held_out`, or itself, goes on, latents kept: what is measured."""
     return goes_on("mocap_longer", mocap_held_out(), num_updates=5_000, learning_rate=8e-4)
 
 
