@@ -82,6 +82,13 @@ def relative_to_root(num_joints: int, *, root_weight: float) -> Float[Tensor, "F
     return per_axis(mixing)
 
 
+def root_counts(feature: Float[Tensor, "F"], root_weight: float) -> Float[Tensor, "F"]:
+    """What each feature of a frame like this counts: the first three, the root's, by weight."""
+    counts = torch.ones_like(feature)
+    counts[:3] = root_weight
+    return counts
+
+
 def per_axis(matrix: Float[Tensor, "J K"]) -> Float[Tensor, "F G"]:
     """A matrix over joints as one over flat poses: the same for each of the three coordinates."""
     return torch.kron(matrix, torch.eye(3))

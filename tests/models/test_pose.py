@@ -14,6 +14,7 @@ from models.pose import (
     continuation_basis,
     cosine_basis,
     facing,
+    root_counts,
 )
 
 
@@ -50,6 +51,10 @@ def test_world_features_are_joints_around_a_weighted_root(walk):
     assert torch.allclose(features[:, :, 0], 2 * canonical[:, :, 0], atol=1e-5)
     relative = canonical[:, :, 1:] - canonical[:, :, :1]
     assert torch.allclose(features[:, :, 1:], relative, atol=1e-5)
+
+
+def test_root_counts_by_its_weight_and_everything_else_once():
+    assert root_counts(torch.zeros(6), 0.5).tolist() == [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
 
 
 def test_root_relative_features_keep_the_last_root(walk):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from tiny_networks import network_of
 
 from models.diffusion import linear_schedule, timesteps
 from models.pose import cosine_basis
@@ -18,15 +19,6 @@ FORMS = {"keyframes": recipes.tiny, "paper": recipes.tiny_paper}
 @pytest.fixture(params=FORMS.values(), ids=FORMS)
 def recipe(request):
     return request.param()
-
-
-def network_of(recipe):
-    torch.manual_seed(0)  # noqa: TID251 - a test may fix the weights it makes
-    network = recipe.build().eval()
-    with torch.no_grad():
-        for parameter in network.parameters():  # zero-initialised layers would hide errors
-            parameter.add_(0.05 * torch.randn(parameter.shape))
-    return network
 
 
 def seen_by(network, recipe, rows):

@@ -9,7 +9,7 @@ from torch import Generator, Tensor, nn
 
 from models.diffusion import Schedule, q_sample
 from models.layers import Affine, reverse_gradient
-from models.pose import RootRelativePoses, WorldPoses
+from models.pose import RootRelativePoses, WorldPoses, root_counts
 from models.system import Batch, Losses
 
 RANGE_IN_DEVIATIONS = 3.0
@@ -176,9 +176,7 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
         z = network.latent_range(network.behaviour_encoder(target, future)[0])
         code = network.coupler.encode_target(target)
         wanted = network.coupler.offsets(network.latent_range.inverse(z), code)
-        counts = torch.ones_like(future[0, 0])
-        counts[:3] = root_weight
-        counts = counts.repeat(wanted.shape[1] // len(counts))
+        counts = root_counts(future[0, 0], root_weight).repeat(wanted.shape[1] // future.shape[2])
     timestep = torch.randint(schedule.num_steps, (rows,), generator=generator, device=device)
     timestep[: round(noisiest_share * rows)] = schedule.num_steps - 1
     alpha_bar = torch.as_tensor(schedule.alpha_bar, dtype=z.dtype, device=device)[timestep]

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
 from models.diffusion import Schedule, ddim_step, q_sample, timesteps
-from models.pose import RootRelativePoses, WorldPoses
+from models.pose import RootRelativePoses, WorldPoses, root_counts
 from models.system import Batch, Losses
 
 
@@ -198,9 +198,8 @@ def refinement_loss(  # noqa: PLR0913 - the symbols of Eq. 10
     refined = network.refined(
         seen.repeat_interleave(num_samples, dim=0), samples.flatten(0, 1)
     ).unflatten(0, samples.shape[:2])
-    weights = torch.ones_like(future[0, 0])
-    weights[:3] = root_weight
-    samples, refined, future = samples * weights, refined * weights, future * weights
+    counts = root_counts(future[0, 0], root_weight)
+    samples, refined, future = samples * counts, refined * counts, future * counts
     reconstruction = best_of(refined, future, exponent=exponent)
     diversity = closeness(refined, sigma=sigma)
     return {

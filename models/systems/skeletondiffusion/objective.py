@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
 from models.diffusion import Schedule, q_sample
+from models.pose import root_counts
 from models.system import Batch, Losses
 from models.systems.skeletondiffusion.networks import Decoder, Denoiser, Encoder, PastNetwork
 from models.systems.skeletondiffusion.nodes import VELOCITY, LimbNodes, RootRelativeNodes
@@ -245,8 +246,7 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
         z = network.to_eigenbasis(network.latent(batch))
         start = network.nodes.start(observation)
         target = network.nodes.target(observation, future)
-        counts = torch.ones_like(target[0, 0])
-        counts[:3] = root_weight
+        counts = root_counts(target[0, 0], root_weight)
     timestep = torch.randint(schedule.num_steps, (rows,), generator=generator, device=device)
     timestep[: round(noisiest_share * rows)] = schedule.num_steps - 1
     alpha_bar = torch.as_tensor(schedule.alpha_bar, dtype=z.dtype, device=device)[timestep]
