@@ -7,9 +7,7 @@ from models.motion.skeleton import BODY21, H36M17, SMPL22
 from models.system import Augmentation, Data
 
 EVERYTHING = {"bandai": 0.5, "cmu": 0.45, "hdm05": 0.05}
-HELD_OUT = (
-    "style=tired",
-    "style=elderly",
+_CMU_HELD_OUT = (
     "subject=135",
     "subject=13",
     "action=washwindow",
@@ -17,7 +15,10 @@ HELD_OUT = (
     "action=directing_traffic",
     "action=soccer",
 )
+HELD_OUT = ("style=tired", "style=elderly", *_CMU_HELD_OUT)
 """Two styles, two subjects and four actions, which what is measured on them must not learn."""
+ONE_STYLE = ("style=masculine", *_CMU_HELD_OUT)
+"""The same with one style of many clips in the place of two that are near to each other."""
 
 TWO_SECONDS = Data(skeleton=BODY21, fps=30.0, num_observed=15, horizon=60)
 """Half a second to two seconds at 30 fps."""

@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from models.diffusion import Schedule, cosine_schedule
 from models.motion.skeleton import BODY21
-from models.protocols import AMASS, H36M, HELD_OUT, TWO_SECONDS, mocap_data
+from models.protocols import AMASS, H36M, HELD_OUT, ONE_STYLE, TWO_SECONDS, mocap_data
 from models.system import Data, Recipe, Stage, goes_on, stepwise
 from models.systems.skeletondiffusion import objective
 from models.systems.skeletondiffusion.graphs import graphs
@@ -226,6 +226,18 @@ def mocap_longer() -> Recipe:
 def mocap_everything() -> Recipe:
     """What ships: a finished `mocap_longer` goes on, on every training clip, latents kept."""
     return goes_on("mocap_everything", mocap(), num_updates=2_000, learning_rate=4e-4)
+
+
+def mocap_one_style() -> Recipe:
+    """`mocap` in one long run without one style, two subjects and four actions: is measured."""
+    schedule = _with_hips(falling)
+    return _recipe(
+        "mocap_one_style",
+        mocap_data(hold_out=ONE_STYLE),
+        Sizes(),
+        schedule,
+        stages=(_autoencoder_stage(4_000), _denoiser_stage(10_000, schedule)),
+    )
 
 
 def mocap_short() -> Recipe:
