@@ -26,8 +26,8 @@ from service.errors import (
 _log = logging.getLogger(__name__)
 
 MAX_UNREAD_BYTES = 1 << 20
-WRITERS = 1
-"""So many threads more than compute, so that one can write while all of those do."""
+WRITERS, EXPRESS = 1, 1
+"""Threads beside those that compute: one to write meanwhile, and one for pressing requests."""
 
 Outcome: TypeAlias = Literal["finished", "failed", "cancelled", "refused"]
 
@@ -90,7 +90,9 @@ class Worker:
     """Runs the requests of many callers on one engine, by several threads, until it is stopped.
 
     So many ``threads`` compute at a time. One that has something to write lets another compute
-    meanwhile: neither does a turn wait for an answer, nor a core for who writes one.
+    meanwhile: neither does a turn wait for an answer, nor a core for who writes one. Nor does a
+    pressing request wait for the turns under way: one thread more may run it, which shares the
+    cores with the others meanwhile.
     At most ``max_rows`` of theirs are under way; where none is, one request of any size. How many
     requests there may be is up to the guard, who counts them before they are read.
     """
@@ -117,7 +119,7 @@ class Worker:
         name = f"engine-{engine.manifest.name}"
         self._threads = [
             Thread(target=self._drive, name=f"{name}-{i}", daemon=True)
-            for i in range(threads + WRITERS)
+            for i in range(threads + WRITERS + EXPRESS)
         ]
         for thread in self._threads:
             thread.start()
@@ -270,31 +272,40 @@ class Worker:
         return job
 
     def _drive(self) -> None:
-        while self._has_work():
+        while (pressing := self._pressing_or_not()) is not None:
             try:
-                self._write(self._computed())
+                self._write(self._computed(pressing=pressing))
             except Exception:  # noqa: BLE001 - the outermost loop: the thread must live
                 # Nobody can say whose fault it was, so everything under way fails.
                 _log.exception("the engine failed")
                 self._fail_all(_unforeseen)
 
-    def _has_work(self) -> bool:
-        """Wait until there is a row to run, and a thread too few; False once it is stopped."""
+    def _pressing_or_not(self) -> bool | None:
+        """Wait until there is a row to run, and a thread too few; None once it is stopped.
+
+        True if the turn is to be for pressing requests alone, as enough others compute already.
+        """
         with self._changed:
             self._changed.wait_for(
                 lambda: (
                     self._stopped
-                    or (self._engine.num_waiting > 0 and self._num_computing < self._shares)
+                    or self._lacks_threads(pressing=False)
+                    or self._lacks_threads(pressing=True)
                 )
             )
+            pressing = not self._lacks_threads(pressing=False)
             self._num_computing += 1
-            return not self._stopped
+            return None if self._stopped else pressing
 
-    def _computed(self) -> list[Event]:
+    def _lacks_threads(self, *, pressing: bool) -> bool:
+        waiting = self._engine.num_pressing_waiting if pressing else self._engine.num_waiting
+        return waiting > 0 and self._num_computing < self._shares + (EXPRESS if pressing else 0)
+
+    def _computed(self, *, pressing: bool) -> list[Event]:
         """What comes of a turn, which has been this thread's to compute."""
         started_s, writes = perf_counter(), True
         try:
-            turn = self._engine.turn(shares=self._shares)
+            turn = self._engine.turn(shares=self._shares, pressing=pressing)
             writes = bool(turn.events)
         finally:
             with self._changed:

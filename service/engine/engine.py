@@ -88,6 +88,11 @@ class Engine:
         """How many rows wait."""
         return self._scheduler.num_waiting
 
+    @property
+    def num_pressing_waiting(self) -> int:
+        """How many of them are of pressing requests, which may have turns of their own."""
+        return self._scheduler.num_pressing_waiting
+
     def add(self, request: Request) -> int:
         """Queue a request and return its id; no graph runs yet.
 
@@ -107,7 +112,13 @@ class Engine:
         )
         with self._lock:
             self._jobs[request_id] = job
-            self._scheduler.add(request_id, rows, deadline_s=job.deadline_s)
+            self._scheduler.add(
+                request_id,
+                rows,
+                deadline_s=job.deadline_s,
+                now_s=job.added_s,
+                seconds_per_turn=self._seconds_per_turn(self._rows_per_step, 1),
+            )
         return request_id
 
     def cancel(self, request_id: int) -> float:
@@ -132,14 +143,15 @@ class Engine:
         """Advance the rows whose turn it is by one; return what this ended, and previews."""
         return self.turn().events
 
-    def turn(self, *, shares: int = 1) -> Turn:
+    def turn(self, *, shares: int = 1, pressing: bool = False) -> Turn:
         """The same, as one of so many threads that share the rows.
 
-        Where it raises, the requests of its rows never end by themselves.
+        A ``pressing`` turn is for pressing requests alone. Where it raises, the requests of its
+        rows never end by themselves.
         """
         started_s = self._clock()
         with self._lock:
-            taken, rows, failures = self._taken(shares)
+            taken, rows, failures = self._taken(shares, pressing=pressing)
         dispatch_s = self._clock() - started_s
         unwanted = 0
         advanced: list[Trajectory | Samples] = []
@@ -200,14 +212,16 @@ class Engine:
                 finished |= _by_id(self.step())
             yield finished.pop(request_id)
 
-    def _taken(self, shares: int) -> tuple[list[Trajectory], list[Trajectory], list[Failure]]:
+    def _taken(
+        self, shares: int, *, pressing: bool
+    ) -> tuple[list[Trajectory], list[Trajectory], list[Failure]]:
         """The rows of this turn, as they waited and as they run, and requests that are too late.
 
         Where another step would be too much for some, the turn is theirs, and cuts them. Those that
         lack their first step fail when not even that fits. The earliest deadline is judged first:
         what the earlier ones need at least runs before.
         """
-        now_s, size = self._clock(), self._scheduler.num_next(shares=shares)
+        now_s, size = self._clock(), self._scheduler.num_next(shares=shares, pressing=pressing)
         late: list[Trajectory] = []
         expired: list[Failure] = []
         ahead_s = 0.0
@@ -237,7 +251,10 @@ class Engine:
         if late:
             return late, [rows.cut() for rows in late], expired
         taken = self._scheduler.take(
-            shares=shares, now_s=now_s, seconds_per_turn=self._seconds_per_turn(size, shares)
+            shares=shares,
+            pressing=pressing,
+            now_s=now_s,
+            seconds_per_turn=self._seconds_per_turn(size, shares),
         )
         for rows in taken:
             job = self._jobs[rows.request_id]

@@ -12,6 +12,9 @@ Of these, an eighth goes round instead: to the request that has waited longest f
 starves. More would have all requests half done and none whole, and a turn of a few rows of each
 costs more than one of many rows of few. Within a request the rows that have waited longest go
 first, and its samples advance together.
+
+A request is pressing if its whole work fits into one turn, or its deadline was tight when it came.
+Turns may be asked for that run those alone, so that they need not wait for what is under way.
 """
 
 import math
@@ -36,12 +39,12 @@ class _Queue(Generic[RowsT]):
     num_waiting: int = 0
     num_running: int = 0
     work: int = 0
+    is_pressing: bool = False
     last_share: int = -1
     removed: bool = False
 
     def popped(self, count: int) -> list[RowsT]:
         """So many of the rows that have waited longest."""
-        self.num_waiting -= count
         self.num_running += count
         popped: list[RowsT] = []
         while count:
@@ -64,6 +67,7 @@ class Scheduler(Generic[RowsT]):
         self._queues: dict[int, _Queue[RowsT]] = {}
         self._num_shares = 0
         self.num_waiting = 0
+        self.num_pressing_waiting = 0
         self.num_running = 0
 
     @property
@@ -76,32 +80,58 @@ class Scheduler(Generic[RowsT]):
         """How many requests have rows, those included that were removed and still run."""
         return len(self._queues)
 
-    def add(self, request_id: int, rows: Iterable[RowsT], *, deadline_s: float = math.inf) -> None:
+    def add(
+        self,
+        request_id: int,
+        rows: Iterable[RowsT],
+        *,
+        deadline_s: float = math.inf,
+        now_s: float = 0.0,
+        seconds_per_turn: float = 0.0,
+    ) -> None:
         """Queue all rows of a new request; its work should be done at this time."""
-        queue = self._queues[request_id] = _Queue(request_id=request_id, deadline_s=deadline_s)
-        for some in rows:
+        queue: _Queue[RowsT] = _Queue(request_id=request_id, deadline_s=deadline_s)
+        added = tuple(rows)
+        work = sum(len(some) * some.turns_left for some in added)
+        tight = _is_tight(work, deadline_s, now_s=now_s, seconds_per_turn=seconds_per_turn)
+        queue.is_pressing = tight or work <= self._rows_per_step
+        self._queues[request_id] = queue
+        for some in added:
             self._put(queue, some)
 
-    def num_next(self, *, shares: int = 1) -> int:
+    def num_next(self, *, shares: int = 1, pressing: bool = False) -> int:
         """How many rows the next turn runs, one of so many threads' turns."""
+        if pressing:
+            return min(self._rows_per_step, self.num_pressing_waiting)
         share = math.ceil((self.num_waiting + self.num_running) / shares)
         return min(self._rows_per_step, share, self.num_waiting)
 
     def take(
-        self, *, shares: int = 1, now_s: float = 0.0, seconds_per_turn: float = 0.0
+        self,
+        *,
+        shares: int = 1,
+        pressing: bool = False,
+        now_s: float = 0.0,
+        seconds_per_turn: float = 0.0,
     ) -> list[RowsT]:
         """The rows to run next, grouped by request, until they are settled.
 
-        ``seconds_per_turn`` of a single row tell which deadlines are tight.
+        ``seconds_per_turn`` of a single row tell which deadlines are tight. A ``pressing`` turn
+        runs rows of pressing requests alone.
         """
 
         def order(queue: _Queue[RowsT]) -> tuple[float, int]:
-            tight = now_s + 2.0 * seconds_per_turn * queue.work >= queue.deadline_s
+            tight = _is_tight(
+                queue.work, queue.deadline_s, now_s=now_s, seconds_per_turn=seconds_per_turn
+            )
             return (queue.deadline_s if tight else math.inf, queue.work)
 
-        total = self.num_next(shares=shares)
+        total = self.num_next(shares=shares, pressing=pressing)
         left = total - (max(1, total // GOES_ROUND) if total > 1 else 0)
-        waiting = sorted((q for q in self._queues.values() if q.num_waiting), key=order)
+        asked = (
+            q for q in self._queues.values() if q.num_waiting and (q.is_pressing or not pressing)
+        )
+        waiting = sorted(asked, key=order)
         counts = dict.fromkeys(waiting, 0)
         for queue in waiting:
             if not left:
@@ -109,10 +139,9 @@ class Scheduler(Generic[RowsT]):
             counts[queue] = min(left, queue.num_waiting)
             left -= counts[queue]
         self._share(counts, total - sum(counts.values()))
-        taken = [rows for queue, count in counts.items() if count for rows in queue.popped(count)]
-        self.num_waiting -= total
-        self.num_running += total
-        return taken
+        return [
+            rows for queue, count in counts.items() if count for rows in self._popped(queue, count)
+        ]
 
     def waiting(self, request_id: int) -> Sequence[RowsT]:
         """The rows of one request that wait."""
@@ -121,9 +150,7 @@ class Scheduler(Generic[RowsT]):
     def take_of(self, request_id: int) -> list[RowsT]:
         """All rows of one request that wait, until they are settled."""
         queue = self._queues[request_id]
-        self.num_waiting -= queue.num_waiting
-        self.num_running += queue.num_waiting
-        return queue.popped(queue.num_waiting)
+        return self._popped(queue, queue.num_waiting)
 
     def settle(self, taken: Iterable[RowsT], following: Iterable[RowsT]) -> None:
         """Put back what a turn made of the rows that it had taken."""
@@ -143,8 +170,7 @@ class Scheduler(Generic[RowsT]):
         if queue is None:
             return
         queue.work -= sum(len(rows) * rows.turns_left for rows in queue.waiting)
-        self.num_waiting -= queue.num_waiting
-        queue.num_waiting = 0
+        self._wait(queue, -queue.num_waiting)
         queue.waiting.clear()
         queue.removed = True
         self._forget(queue)
@@ -155,9 +181,20 @@ class Scheduler(Generic[RowsT]):
 
     def _put(self, queue: _Queue[RowsT], rows: RowsT) -> None:
         queue.waiting.append(rows)
-        queue.num_waiting += len(rows)
         queue.work += len(rows) * rows.turns_left
-        self.num_waiting += len(rows)
+        self._wait(queue, len(rows))
+
+    def _popped(self, queue: _Queue[RowsT], count: int) -> list[RowsT]:
+        self._wait(queue, -count)
+        self.num_running += count
+        return queue.popped(count)
+
+    def _wait(self, queue: _Queue[RowsT], count: int) -> None:
+        """Count so many more rows of a request, or fewer, that wait."""
+        queue.num_waiting += count
+        self.num_waiting += count
+        if queue.is_pressing:
+            self.num_pressing_waiting += count
 
     def _share(self, counts: dict[_Queue[RowsT], int], left: int) -> None:
         for queue in sorted(counts, key=lambda queue: (counts[queue] > 0, queue.last_share)):
@@ -173,3 +210,8 @@ class Scheduler(Generic[RowsT]):
     def _forget(self, queue: _Queue[RowsT]) -> None:
         if queue.removed and not queue.num_running:
             self._queues.pop(queue.request_id, None)
+
+
+def _is_tight(work: int, deadline_s: float, *, now_s: float, seconds_per_turn: float) -> bool:
+    """Whether the work would take half of the time left or more."""
+    return now_s + 2.0 * seconds_per_turn * work >= deadline_s

@@ -87,6 +87,40 @@ def test_short_request_among_long_ones_runs_in_its_first_turn():
     assert scheduler.waiting(8) == ()
 
 
+def test_pressing_turn_is_for_requests_that_fit_into_one():
+    scheduler = scheduler_of((50, 10), (8, 8), (65, 1), rows_per_step=64)
+    assert counts(scheduler.take(pressing=True)) == {1: 8}
+    assert scheduler.take(pressing=True) == []
+    assert scheduler.num_waiting == 50 + 65
+
+
+def test_pressing_turn_is_for_deadlines_that_were_tight_from_the_start():
+    scheduler = scheduler_of((50, 10), rows_per_step=8)
+    for request_id, deadline_s in ((1, 12.0), (2, 99.0)):  # of work of 5 seconds, from 10.0 on
+        rows = [Some(request_id, 0, 10, turns_left=10)]
+        scheduler.add(request_id, rows, deadline_s=deadline_s, now_s=10.0, seconds_per_turn=0.05)
+    assert counts(scheduler.take(pressing=True)) == {1: 8}
+
+
+def test_what_is_left_of_a_long_request_is_not_pressing():
+    scheduler = scheduler_of((50, 2), rows_per_step=64)
+    settle(scheduler, scheduler.take())
+    assert (scheduler.num_waiting, scheduler.num_pressing_waiting) == (50, 0)
+
+
+def test_pressing_rows_that_wait_are_counted_until_they_run_or_are_forgotten():
+    scheduler = scheduler_of((3, 2), (4, 1), (50, 10), rows_per_step=16)
+    assert scheduler.num_pressing_waiting == 7
+    scheduler.remove(1)
+    assert scheduler.num_pressing_waiting == 3
+    taken = scheduler.take(pressing=True)
+    assert scheduler.num_pressing_waiting == 0
+    settle(scheduler, taken)
+    assert scheduler.num_pressing_waiting == 3
+    scheduler.take_of(0)
+    assert scheduler.num_pressing_waiting == 0
+
+
 @pytest.mark.parametrize("rows_per_step", [32, 64, 128])
 def test_equal_requests_end_about_in_the_order_of_their_arrival(rows_per_step: int):
     scheduler = scheduler_of(*[(50, 10)] * 8, rows_per_step=rows_per_step)

@@ -194,6 +194,35 @@ def test_no_more_threads_compute_than_may(start: Callable[..., Worker], runner: 
     assert max(computing) == 2
 
 
+def test_request_of_one_turn_does_not_wait_for_those_under_way(
+    start: Callable[..., Worker], runner: HeldRunner
+):
+    worker, computed = start(threads=1), runner.run
+    long, is_held, may_go_on = replace(WALK, num_samples=60), Event(), Event()
+
+    def held(role: str, tensors: Tensors, parts: Sequence[Part]) -> Tensors:
+        if sum(count for _, count in parts) == long.num_samples:
+            is_held.set()
+            assert may_go_on.wait(30.0)
+        return computed(role, tensors, parts)
+
+    runner.run = held  # type: ignore[method-assign]
+
+    async def both() -> None:
+        first = asyncio.ensure_future(worker.predict(long, answer))
+        await asyncio.to_thread(is_held.wait)
+        others = replace(WALK, num_samples=61)  # of more than a turn, so it waits for its own
+        second = asyncio.ensure_future(worker.predict(others, answer))
+        try:
+            await asyncio.wait_for(worker.predict(WALK, answer), 30.0)
+            assert not any(task.done() for task in (first, second))
+        finally:
+            may_go_on.set()
+        await asyncio.gather(first, second)
+
+    run(both())
+
+
 def test_timing_is_within_the_time_that_passed(start: Callable[..., Worker]):
     timings: list[Timing] = []
 
