@@ -262,7 +262,9 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     )
     condition = network.condition(batch["seen"])
     with torch.no_grad(), torch.autocast(device.type, dtype=torch.bfloat16):
-        near = _nearest(network, x_t, timestep, condition, start, target, counts)
+        near = _nearest(
+            network, x_t, timestep, condition.bfloat16(), start.bfloat16(), target, counts
+        )
     chosen = x_t[:, torch.arange(rows, device=device), near]
     x0 = network.denoiser(network.from_eigenbasis(chosen), timestep, condition)
     difference = network.to_eigenbasis(x0) - z
