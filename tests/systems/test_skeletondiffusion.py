@@ -9,7 +9,11 @@ from models.diffusion import cosine_schedule, ddim_step
 from models.motion.kinematics import bone_lengths
 from models.motion.skeleton import BODY21, H36M17, SMPL22
 from models.systems.skeletondiffusion import objective, recipes
-from models.systems.skeletondiffusion.nodes import LimbNodes, RootRelativeNodes, continuing_spline
+from models.systems.skeletondiffusion.nodes import (
+    CanonicalNodes,
+    RootRelativeNodes,
+    continuing_spline,
+)
 from models.systems.skeletondiffusion.noise import (
     SMALLEST_EIGENVALUE,
     NodeGraph,
@@ -197,15 +201,21 @@ def test_networks_have_the_published_sizes(recipe, autoencoder, denoiser):
 # Motion on the nodes
 
 
-def limb_nodes(**changes) -> LimbNodes:
-    sizes = {"frames_per_tick": 10, "knot_frames": 3, "knots_per_tick": 7, "root_weight": 2.0}
-    return LimbNodes(BODY21, num_observed=15, horizon=60, **(sizes | changes))
+def canonical_nodes(*, rigid: bool) -> CanonicalNodes:
+    return CanonicalNodes(
+        BODY21, num_observed=15, horizon=60, frames_per_tick=10,
+        knot_frames=3, knots_per_tick=7, root_weight=2.0, rigid=rigid,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     "nodes",
-    [limb_nodes(), RootRelativeNodes(BODY21, num_observed=15, horizon=60, box_m=1.5)],
-    ids=["limbs", "root-relative"],
+    [
+        canonical_nodes(rigid=True),
+        canonical_nodes(rigid=False),
+        RootRelativeNodes(BODY21, num_observed=15, horizon=60, box_m=1.5),
+    ],
+    ids=["limbs", "positions", "root-relative"],
 )
 def test_motion_comes_back_into_the_world(nodes):
     poses = body(75)
@@ -217,7 +227,7 @@ def test_motion_comes_back_into_the_world(nodes):
 
 
 def test_limbs_keep_their_length_whatever_the_decoder_says():
-    nodes = limb_nodes()
+    nodes = canonical_nodes(rigid=True)
     observation = body(15)
     outputs = torch.randn(21, 1, 3, 21, generator=generator())
     start = nodes.start(observation)
@@ -225,6 +235,20 @@ def test_limbs_keep_their_length_whatever_the_decoder_says():
     seen = bone_lengths(observation[0].numpy(), BODY21.parents).mean(axis=0)
     lengths = bone_lengths(future, BODY21.parents)
     np.testing.assert_allclose(lengths, np.broadcast_to(seen, lengths.shape), atol=2e-5)
+
+
+def test_positions_follow_a_body_that_grows():
+    nodes = canonical_nodes(rigid=False)
+    observation = body(1).repeat(1, 15, 1, 1)  # at rest, as the growth begins
+    growth = 1 + 0.2 * (torch.arange(1, 61) / 60)[:, None, None].square()
+    hips = observation[:, -1:, :1]
+    future = hips + (observation[:, -1:] - hips) * growth
+    frames = nodes.future(observation, future).flatten(2).unflatten(2, (60, 3))
+    points = torch.matmul(torch.linalg.pinv(nodes.spline), frames)  # a parabola is such a spline
+    missing = nodes.decoder_ticks * nodes.outputs_per_tick - points.flatten(2).shape[2]
+    outputs = torch.nn.functional.pad(points.flatten(2), (0, missing))
+    motion = nodes.motion(outputs.unflatten(2, (nodes.decoder_ticks, -1)), nodes.start(observation))
+    torch.testing.assert_close(motion, nodes.target(observation, future), atol=1e-5, rtol=0)
 
 
 def test_spline_starts_with_the_observed_value_and_velocity():
@@ -245,9 +269,11 @@ def test_spline_holds_a_constant_step():
     torch.testing.assert_close(spline @ points + 0.3 * glide, 0.3 * frame, atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("rigid", [True, False])
 @pytest.mark.parametrize("every", [2, 3, 5])
-def test_frames_that_are_judged_are_frames_of_the_motion(every: int):
-    nodes, start = limb_nodes(), limb_nodes().start(body(15))
+def test_frames_that_are_judged_are_frames_of_the_motion(every: int, rigid: bool):
+    nodes = canonical_nodes(rigid=rigid)
+    start = nodes.start(body(15))
     outputs = torch.randn(21, 1, 3, 21, generator=generator())
     whole = nodes.motion(outputs, start)
     torch.testing.assert_close(

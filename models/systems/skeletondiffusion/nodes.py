@@ -5,6 +5,7 @@ know of the observation (``start``: one row of numbers per node).
 """
 
 import functools
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -19,7 +20,7 @@ MOVES_BY = 3.0
 """What was moved in half a second counts this much more than where it is."""
 
 LAST, VELOCITY, LENGTH = slice(0, 3), slice(6, 9), slice(9, 10)
-"""What `LimbNodes.start` says of a limb; between them, where it was a frame before."""
+"""What `CanonicalNodes.start` says of a node; between them, where it was a frame before."""
 
 
 class RootRelativeNodes(nn.Module):
@@ -91,11 +92,12 @@ class RootRelativeNodes(nn.Module):
         return torch.cat([root.expand(-1, joints.shape[1], -1, -1), joints], dim=2)
 
 
-class LimbNodes(nn.Module):
+class CanonicalNodes(nn.Module):
     """Ours: every joint but the root as its limb, the root as its path, in the canonical frame.
 
     A future is a cubic B-spline that leaves the last observed pose with the observed velocity;
-    limbs are turned, never stretched: each keeps its mean observed length.
+    limbs are turned, never stretched: each keeps its mean observed length. Nodes that are not
+    ``rigid`` say positions relative to the root instead, as the paper's do, and limbs can stretch.
     """
 
     start_width = 10
@@ -116,6 +118,7 @@ class LimbNodes(nn.Module):
         knot_frames: int,
         knots_per_tick: int,
         root_weight: float,
+        rigid: bool = True,
     ) -> None:
         super().__init__()
         self.graph: NodeGraph = with_root(skeleton)
@@ -129,9 +132,11 @@ class LimbNodes(nn.Module):
         self.register_buffer("scale", torch.ones(skeleton.num_joints))
         held = torch.cat([spline, glide, torch.ones_like(glide)], dim=1)
         self.register_buffer("basis", held, persistent=False)
+        self.rigid = rigid
+        self._origins = list(skeleton.parents[1:]) if rigid else [0] * (skeleton.num_joints - 1)
         joints, xyz = torch.eye(skeleton.num_joints), torch.ones(3, 3)
         self.register_buffer("of_one_limb", torch.kron(joints, xyz), persistent=False)
-        self.register_buffer("to_joints", per_axis(_chains(skeleton)), persistent=False)
+        self.register_buffer("to_joints", per_axis(_chains(self._origins)), persistent=False)
         self.register_buffer(
             "weights",
             relative_to_root(skeleton.num_joints, root_weight=root_weight),
@@ -140,7 +145,6 @@ class LimbNodes(nn.Module):
         is_root = torch.arange(self.of_one_limb.shape[0]) < 3
         self.register_buffer("root", is_root.float(), persistent=False)
         self._pairs = facing(skeleton)
-        self._parents = list(skeleton.parents[1:])
 
     @property
     def spline(self) -> Float[Tensor, "H P"]:
@@ -152,34 +156,35 @@ class LimbNodes(nn.Module):
         """What the observed velocity adds to the frames."""
         return self.basis[:, -2:-1]
 
-    def _limbs(
+    def _vectors(
         self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B L J 3"]
     ) -> Float[Tensor, "N B L 3"]:
+        """From the joint that a node is relative to, to its own; the root's path."""
         canonical = Frame(observation, self._pairs).enter(poses).permute(2, 0, 1, 3)
-        return torch.cat([canonical[:1], canonical[1:] - canonical[self._parents]])
+        return torch.cat([canonical[:1], canonical[1:] - canonical[self._origins]])
 
     def start(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "N B S"]:
-        """The last limbs and those before, their velocity in metres a frame, their lengths."""
-        limbs = self._limbs(observation, observation)
-        velocity = (limbs[:, :, -1] - limbs[:, :, -3]) / 2
-        lengths = limbs.square().sum(dim=3).add(1e-12).sqrt()
+        """The last vectors and those before, their velocity in metres a frame, their lengths."""
+        vectors = self._vectors(observation, observation)
+        velocity = (vectors[:, :, -1] - vectors[:, :, -3]) / 2
+        lengths = vectors.square().sum(dim=3).add(1e-12).sqrt()
         # Term by term: onnxruntime's sums round differently in vectors and in what is left over.
         frames = lengths.unbind(dim=2)
         mean = functools.reduce(torch.add, frames) / len(frames)
-        return torch.cat([limbs[:, :, -1], limbs[:, :, -2], velocity, mean[:, :, None]], dim=2)
+        return torch.cat([vectors[:, :, -1], vectors[:, :, -2], velocity, mean[:, :, None]], dim=2)
 
     def observed(self, observation: Float[Tensor, "B T J 3"]) -> Float[Tensor, "N B T 3"]:
         """The frames of the observation, relative to the last, in whose place it stands itself."""
-        limbs = self._limbs(observation, observation)
-        relative = (limbs[:, :, :-1] - limbs[:, :, -1:]) * MOVES_BY
-        return torch.cat([relative, limbs[:, :, -1:]], dim=2) / self.scale[:, None, None, None]
+        vectors = self._vectors(observation, observation)
+        relative = (vectors[:, :, :-1] - vectors[:, :, -1:]) * MOVES_BY
+        return torch.cat([relative, vectors[:, :, -1:]], dim=2) / self.scale[:, None, None, None]
 
     def future(
         self, observation: Float[Tensor, "B T J 3"], poses: Float[Tensor, "B H J 3"]
     ) -> Float[Tensor, "N B K F"]:
         """The ticks of the future, relative to the last observed pose."""
-        last = self._limbs(observation, observation[:, -1:])
-        relative = (self._limbs(observation, poses) - last) / self.scale[:, None, None, None]
+        last = self._vectors(observation, observation[:, -1:])
+        relative = (self._vectors(observation, poses) - last) / self.scale[:, None, None, None]
         return relative.unflatten(2, (-1, self.frames_per_tick)).flatten(3)
 
     def target(
@@ -206,6 +211,8 @@ class LimbNodes(nn.Module):
         )
         given = torch.stack([velocity.flatten(1), last.flatten(1)], dim=1)
         moved = torch.matmul(self.basis[every - 1 :: every], torch.cat([free, given], dim=1))
+        if not self.rigid:
+            return torch.matmul(moved, self.to_joints)
         squared = torch.matmul(moved * moved, self.of_one_limb)
         lengths = length.expand(-1, -1, 3).flatten(1)[:, None]
         turned = moved * (lengths * (squared + SHORTEST_SQUARED).rsqrt())
@@ -246,9 +253,9 @@ def continuing_spline(
     return spline.float(), glide[:, None].float()
 
 
-def _chains(skeleton: Skeleton) -> Float[Tensor, "J J"]:
-    """1 where a limb (row) lies on the way from the root to a joint (column)."""
-    chains = torch.eye(skeleton.num_joints)
-    for joint in range(1, skeleton.num_joints):
-        chains[:, joint] += chains[:, skeleton.parents[joint]]
+def _chains(origins: Sequence[int]) -> Float[Tensor, "J J"]:
+    """1 where a node (row) lies on the way from the root to a joint (column)."""
+    chains = torch.eye(len(origins) + 1)
+    for joint, origin in enumerate(origins, start=1):
+        chains[:, joint] += chains[:, origin]
     return chains

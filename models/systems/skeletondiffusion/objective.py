@@ -12,7 +12,7 @@ from models.diffusion import Schedule, q_sample
 from models.pose import root_counts
 from models.system import Batch, Losses
 from models.systems.skeletondiffusion.networks import Decoder, Denoiser, Encoder, PastNetwork
-from models.systems.skeletondiffusion.nodes import VELOCITY, LimbNodes, RootRelativeNodes
+from models.systems.skeletondiffusion.nodes import VELOCITY, CanonicalNodes, RootRelativeNodes
 from models.systems.skeletondiffusion.noise import NodeGraph
 from models.systems.skeletondiffusion.typed_graph import mixed
 
@@ -38,7 +38,7 @@ class SkeletonDiffusion(nn.Module):
     def __init__(
         self,
         *,
-        nodes: LimbNodes | RootRelativeNodes,
+        nodes: CanonicalNodes | RootRelativeNodes,
         encoder: Encoder,
         decoder: Decoder,
         denoiser: Denoiser,
@@ -148,13 +148,13 @@ def fit_linear_parts(
     The recurrences beside them start from nothing and learn what a linear code cannot say.
 
     Args:
-        network: a SkeletonDiffusion on `LimbNodes`, with shortcuts.
+        network: a SkeletonDiffusion on `CanonicalNodes`, with shortcuts.
         next_batch: source of batches.
         num_batches: how many of them to fit to.
         deviation: of the latents.
         whitening: 1 gives every latent the same variance, 0 that of its motion.
     """
-    nodes: LimbNodes = network.nodes
+    nodes: CanonicalNodes = network.nodes
     types = torch.tensor(nodes.graph.types)
     batches = [next_batch() for _ in range(num_batches)]
     moved = [nodes.future(batch["observation"], batch["future"]) for batch in batches]
@@ -262,7 +262,9 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     )
     condition = network.condition(batch["seen"])
     with torch.no_grad(), torch.autocast(device.type, dtype=torch.bfloat16):
-        near = _nearest(network, x_t, timestep, condition, start, target, counts)
+        near = _nearest(
+            network, x_t, timestep, condition.bfloat16(), start.bfloat16(), target, counts
+        )
     chosen = x_t[:, torch.arange(rows, device=device), near]
     x0 = network.denoiser(network.from_eigenbasis(chosen), timestep, condition)
     difference = network.to_eigenbasis(x0) - z

@@ -14,7 +14,7 @@ from models.system import Data, Recipe, Stage, goes_on, stepwise
 from models.systems.skeletondiffusion import objective
 from models.systems.skeletondiffusion.graphs import graphs
 from models.systems.skeletondiffusion.networks import Decoder, Denoiser, Encoder, PastNetwork
-from models.systems.skeletondiffusion.nodes import LimbNodes, RootRelativeNodes
+from models.systems.skeletondiffusion.nodes import CanonicalNodes, RootRelativeNodes
 from models.systems.skeletondiffusion.noise import (
     NodeGraph,
     constant,
@@ -27,6 +27,7 @@ from models.systems.skeletondiffusion.objective import SkeletonDiffusion
 
 NUM_STEPS = 10
 DEFAULT_STEPS = 3  # the knee of the curve on `valid`
+ROOT_WEIGHT = 2.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -48,9 +49,9 @@ class Sizes:
     activation: Callable[[torch.Tensor], torch.Tensor] = functional.silu
 
 
-def build(*, data: Data, sizes: Sizes, root_weight: float) -> SkeletonDiffusion:
-    """Our form: limbs that keep their length, the hips a node with the trajectory."""
-    nodes = LimbNodes(
+def build(*, data: Data, sizes: Sizes, root_weight: float, rigid: bool = True) -> SkeletonDiffusion:
+    """Our form: the hips a node with the trajectory, ``rigid`` limbs or positions that stretch."""
+    nodes = CanonicalNodes(
         data.skeleton,
         num_observed=data.num_observed,
         horizon=data.horizon,
@@ -58,6 +59,7 @@ def build(*, data: Data, sizes: Sizes, root_weight: float) -> SkeletonDiffusion:
         knot_frames=3,
         knots_per_tick=7,
         root_weight=root_weight,
+        rigid=rigid,
     )
     past = PastNetwork(
         nodes.graph, inputs=nodes.observed_width, width=sizes.past, activation=sizes.activation
@@ -74,7 +76,7 @@ def build_paper(*, data: Data, sizes: Sizes, box_m: float) -> SkeletonDiffusion:
 
 
 def _network(
-    nodes: LimbNodes | RootRelativeNodes,
+    nodes: CanonicalNodes | RootRelativeNodes,
     sizes: Sizes,
     past: PastNetwork | None,
     *,
@@ -177,7 +179,7 @@ def _recipe(
         system="skeletondiffusion",
         description="Latent diffusion on the skeleton's graph; half a second to two seconds.",
         data=data,
-        build=partial(build, data=data, sizes=sizes, root_weight=2.0),
+        build=partial(build, data=data, sizes=sizes, root_weight=ROOT_WEIGHT),
         graphs=graphs,
         schedule=schedule,
         x_t_shape=(data.skeleton.num_joints, sizes.latent),
@@ -253,6 +255,30 @@ def mocap_isotropic() -> Recipe:
 def mocap_constant_gamma() -> Recipe:
     """The ablation of Table 4: `mocap_short` with gamma_t = 1."""
     return _held_out("mocap_constant_gamma", _with_hips(constant), num_updates=2_500)
+
+
+def _positions(recipe: Recipe) -> Recipe:
+    """The recipe where nodes say joint positions, as the paper's do, and limbs can stretch."""
+    return dataclasses.replace(
+        recipe,
+        name=recipe.name.replace("mocap", "mocap_positions"),
+        build=partial(build, data=recipe.data, sizes=Sizes(), root_weight=ROOT_WEIGHT, rigid=False),
+    )
+
+
+def mocap_positions_autoencoder() -> Recipe:
+    """The autoencoder that the ablations on positions start from."""
+    return _positions(mocap_autoencoder())
+
+
+def mocap_positions_short() -> Recipe:
+    """`mocap_short` on positions, from a finished `mocap_positions_autoencoder`."""
+    return _positions(mocap_short())
+
+
+def mocap_positions_isotropic() -> Recipe:
+    """The ablation of Table 4 on positions: noise that knows no skeleton."""
+    return _positions(mocap_isotropic())
 
 
 def mocap() -> Recipe:

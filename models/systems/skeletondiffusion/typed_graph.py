@@ -28,7 +28,10 @@ class TypedLinear(nn.Module):
     def forward(self, x: Float[Tensor, "N B I"]) -> Float[Tensor, "N B O"]:
         """The features of each node by the weights of its type."""
         features = torch.bmm(x, self.weight[self.types])
-        return features if self.bias is None else features + self.bias[self.types]
+        if self.bias is None:
+            return features
+        # As autocast computes: a sum of two precisions is slow, and so is all that follows from it.
+        return features + self.bias[self.types].to(features.dtype)
 
 
 class TypedGraphLinear(nn.Module):
@@ -109,7 +112,8 @@ class TypedGraphAttention(nn.Module):
 
     def forward(self, x: Float[Tensor, "N B C"]) -> Float[Tensor, "N B C"]:
         """x and what each node took from the others."""
-        normed = x * (x.square().mean(dim=2, keepdim=True) + 1e-6).rsqrt() * self.scale
+        scale = self.scale.to(x.dtype)
+        normed = x * (x.square().mean(dim=2, keepdim=True) + 1e-6).rsqrt() * scale
         nodes, shape = int(x.shape[0]), (self.heads, self.head_width)
         query, key, value = (
             part(normed).reshape(nodes, -1, *shape).permute(1, 2, 0, 3)
