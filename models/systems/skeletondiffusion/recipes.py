@@ -238,7 +238,7 @@ def mocap_one_style() -> Recipe:
         mocap_data(hold_out=ONE_STYLE),
         Sizes(),
         schedule,
-        stages=(_autoencoder_stage(4_000), _denoiser_stage(10_000, schedule)),
+        stages=(_autoencoder_stage(4_000), _denoiser_stage(7_000, schedule)),
     )
 
 
