@@ -6,7 +6,7 @@ import { Figures } from "./figures";
 import { groundOf, type Motion, poseAt, type Track } from "./motion";
 import type { Palette } from "./palette";
 import { RegionBalls } from "./regions";
-import { hipsOf, watched } from "./skeleton";
+import { hipsOf, rootOf, watched } from "./skeleton";
 import type { Stage } from "./stage";
 import { type Trail, Trails } from "./trails";
 
@@ -77,7 +77,7 @@ export class View {
     this.motion = motion;
     this.answer = null;
     this.ground = groundOf(motion.track);
-    this.root = Math.max(0, motion.skeleton.parents.indexOf(-1));
+    this.root = rootOf(motion.skeleton);
     this.joints = watched(motion.skeleton).slice(0, MAX_WATCHED);
     this.pose = new Float32Array(motion.track.joints * 3);
     this.nowPose = new Float32Array(motion.track.joints * 3);
