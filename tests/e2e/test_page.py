@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from browsing import (
     DESK,
+    PATIENCE_MS,
     Server,
     chromium,
     needs_chromium,
@@ -19,6 +20,7 @@ from browsing import (
     slide,
     sync_api,
 )
+from live import until
 from tiny_bundles import walking
 
 from models.motion.formats.bvh import write_bvh
@@ -173,6 +175,19 @@ def test_two_actions_are_composed_and_performed(page):
     for entry, name in zip(entries.all(), ("walk turn left", "wave both hands"), strict=True):
         expect(entry).to_contain_text(name)
         expect(entry.locator("small")).to_contain_text(" s")  # how long it takes
+
+
+def test_who_runs_away_stays_in_view(page):
+    page.locator("label", has=page.locator("#ask-perform")).click()
+    page.locator("#clear").evaluate("button => button.click()")  # which may have nothing to do
+    page.click("[data-action=run]")
+    page.click("[data-action=run]")
+    slide(page, "#num-samples", 3)
+    page.click("#perform")
+    page.locator('#timing[data-futures="3"]').wait_for()
+    page.uncheck("#show-trails")
+    seek(page, 4.0)  # some twenty metres away
+    until(lambda: coloured(picture(page)) > 200, patience_s=PATIENCE_MS / 1000)
 
 
 def test_a_dropped_bvh_is_predicted_in_its_own_skeleton(page, tmp_path, complaints):

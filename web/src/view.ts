@@ -130,16 +130,17 @@ export class View {
 
     const since = seconds + (this.now - this.answered) / motion.fps;
     const ahead = answer && seconds > 0 ? since * answer.fps - 1 : null;
-    this.drawFutures(ahead, centre);
+    const there = this.drawFutures(ahead);
     this.drawTruth(seconds);
     if (ahead !== null && answer?.regions && this.look.regions) {
       this.regions.draw(answer.regions, this.joints, ahead);
     } else this.regions.hide();
-    this.stage.followTo(centre);
+    this.stage.follow(there ?? centre, centre);
     this.stage.invalidate();
   }
 
-  private drawFutures(ahead: number | null, centre: Vector3): void {
+  /** Where they are on average. */
+  private drawFutures(ahead: number | null): Vector3 | null {
     const { answer } = this;
     const { chosen, crowd } = ahead === null || !answer ? { chosen: [], crowd: [] } : this.shown();
     this.crowdMaterial.opacity = Math.min(0.5, 0.16 + 2 / Math.max(crowd.length, 1));
@@ -152,11 +153,12 @@ export class View {
         if (!track || ahead === null) continue;
         this.futurePose(track, ahead);
         figures.add(this.pose, this.colourOf(sample, ahead));
-        if (figures === this.chosen) mean.add(this.rootOf(this.pose));
+        mean.add(this.rootOf(this.pose));
       }
       figures.end();
     }
-    if (chosen.length > 0) centre.lerp(mean.divideScalar(chosen.length), 0.5); // both stay in view
+    const count = chosen.length + crowd.length;
+    return count > 0 ? mean.divideScalar(count) : null;
   }
 
   private drawTruth(seconds: number): void {
