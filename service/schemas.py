@@ -337,7 +337,9 @@ class FileObservation(_Body):
     skeleton: SkeletonBody
     axes: AxesBody
     fps: float
-    parents: list[int] = Field(description="index of each joint's parent, -1 for the root")
+    parents: list[int] = Field(
+        description="the joint from which a bone comes to each, -1 where none does: to draw it by"
+    )
     start_s: float = Field(description="of the first frame in the file")
     duration_s: float = Field(description="of the whole file")
 

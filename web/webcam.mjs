@@ -17,7 +17,7 @@ for (const file of ["vision_bundle.mjs", "wasm"]) {
 const kept = await readFile(MODEL.file).catch(() => null);
 if (kept && isModel(kept)) process.exit();
 const found = await downloaded();
-if (!isModel(found)) throw new Error(`${MODEL.url}: its sha256 is not ${MODEL.sha256}.`);
+if (!isModel(found)) fail(`its sha256 is not ${MODEL.sha256}`);
 await writeFile(MODEL.file, found);
 
 function isModel(bytes) {
@@ -25,7 +25,12 @@ function isModel(bytes) {
 }
 
 async function downloaded() {
-  const answer = await fetch(MODEL.url);
-  if (!answer.ok) throw new Error(`${MODEL.url}: found ${answer.status}; it must be there.`);
+  const answer = await fetch(MODEL.url).catch(({ cause }) => fail(cause?.message ?? "no answer"));
+  if (!answer.ok) fail(`found ${answer.status}`);
   return Buffer.from(await answer.arrayBuffer());
+}
+
+function fail(why) {
+  console.error(`${MODEL.url}: ${why}; the webcam works once that file is in web/${MODEL.file}.`);
+  process.exit(1);
 }

@@ -80,7 +80,7 @@ def _frozen(seen: Seen) -> Iterator[Finding]:
 def _limbs(body: Body) -> Iterator[Finding]:
     noise = {}
     for upper, lower in LIMBS:
-        if lower in body:
+        if upper in body and lower in body:
             lengths = np.linalg.norm(body[lower] - body[upper], axis=-1)
             noise[lower] = float(np.std(lengths) / max(float(np.mean(lengths)), 1e-9))
     loose = {bone: part for bone, part in noise.items() if part > MAX_LIMB_NOISE}

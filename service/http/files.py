@@ -9,6 +9,7 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 
+from models.motion.bones import bone_parents
 from models.motion.formats.errors import FormatError, MalformedFileError, UnsupportedFileError
 from models.motion.formats.files import SUFFIXES, read_motion
 from models.motion.formats.pose_json import request_fields, with_nulls
@@ -147,7 +148,7 @@ def _fields(motion: Motion, start_s: float, end_s: float | None, media_type: str
     holes = bool(np.isnan(poses).any())
     return fields | {
         "poses": with_nulls(fields["poses"]) if holes and media_type == JSON else poses,
-        "parents": fields["skeleton"]["parents"],
+        "parents": list(bone_parents(cut.skeleton)),
         "start_s": start_s,
         "duration_s": motion.duration,
     }

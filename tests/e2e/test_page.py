@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from browsing import (
     DESK,
+    PATIENCE_MS,
     Server,
     chromium,
     needs_chromium,
@@ -19,12 +20,13 @@ from browsing import (
     slide,
     sync_api,
 )
+from live import until
 from tiny_bundles import walking
 
 from models.motion.formats.bvh import write_bvh
 from models.motion.formats.files import read_motion
 from models.motion.motion import Motion
-from models.motion.skeleton import BODY21
+from models.motion.skeleton import BODY21, Skeleton
 
 expect = sync_api.expect
 
@@ -175,6 +177,19 @@ def test_two_actions_are_composed_and_performed(page):
         expect(entry.locator("small")).to_contain_text(" s")  # how long it takes
 
 
+def test_who_runs_away_stays_in_view(page):
+    page.locator("label", has=page.locator("#ask-perform")).click()
+    page.locator("#clear").evaluate("button => button.click()")  # which may have nothing to do
+    page.click("[data-action=run]")
+    page.click("[data-action=run]")
+    slide(page, "#num-samples", 3)
+    page.click("#perform")
+    page.locator('#timing[data-futures="3"]').wait_for()
+    page.uncheck("#show-trails")
+    seek(page, 4.0)  # some twenty metres away
+    until(lambda: coloured(picture(page)) > 200, patience_s=PATIENCE_MS / 1000)
+
+
 def test_a_dropped_bvh_is_predicted_in_its_own_skeleton(page, tmp_path, complaints):
     motion = Motion(name="mine", skeleton=BODY21, positions=walking(90, fps=60.0), fps=60.0)
     write_bvh(tmp_path / "mine.bvh", motion)
@@ -185,6 +200,20 @@ def test_a_dropped_bvh_is_predicted_in_its_own_skeleton(page, tmp_path, complain
     seek(page, 0.7)
     assert coloured(picture(page)) > 200
     assert complaints == []
+
+
+def test_what_is_drawn_of_a_scene_is_the_body_and_the_way_of_its_hips(page, tmp_path):
+    parents = (-1, *(parent + 1 for parent in BODY21.parents))
+    scene = Skeleton(name="scene", joints=("joint_Root", *BODY21.joints), parents=parents)
+    body = walking(90) + np.array([5.0, 0.0, 0.0])  # from the origin, where the scene's root is
+    poses = np.concatenate([np.zeros((90, 1, 3)), body], axis=1)
+    write_bvh(tmp_path / "far.bvh", Motion(name="far", skeleton=scene, positions=poses, fps=30.0))
+    drop(page, tmp_path / "far.bvh")
+    expect(page.locator("#motion-text")).to_contain_text("far: 3.0 s")
+    page.locator('#timing[data-futures="20"]').wait_for()
+    page.check("#show-trails")
+    seek(page, -0.5)
+    assert coloured(picture(page)) > 100  # the futures' ways, which a root that stands has none of
 
 
 def test_a_file_that_is_no_motion_is_refused_in_a_sentence(page, tmp_path):
@@ -260,6 +289,9 @@ def test_it_says_when_the_server_is_away_and_goes_on_when_it_is_back(page, serve
 def test_it_fits_a_phone_and_the_keyboard_reaches_the_controls(page):
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("() => document.documentElement.scrollWidth") == 390
+    page.locator("#save-json").focus()  # the last of the controls, beside which the scene is seen
+    expect(page.locator("#canvas")).to_be_in_viewport(ratio=1)
+    expect(page.locator("#save-json")).to_be_in_viewport(ratio=1)
     page.locator("#play").focus()
     reached = []
     for _ in range(12):

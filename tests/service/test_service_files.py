@@ -15,7 +15,7 @@ from tiny_bundles import walking
 from models.motion.formats.bvh import write_bvh
 from models.motion.formats.npz import clip_of, write_archive
 from models.motion.motion import Motion
-from models.motion.skeleton import BODY21
+from models.motion.skeleton import BODY21, Skeleton
 from service.media import MSGPACK, decoded
 
 SAMPLES = Path(__file__).parents[3] / "shared/data/samples"
@@ -49,6 +49,20 @@ def test_file_comes_back_as_what_predict_takes(service: Service):
     predicted = service.post(request | {"num_samples": 2, "seed": 1})
     assert predicted.status_code == 200, predicted.text
     assert orjson.loads(predicted.content)["joints"] == answer["skeleton"]["joints"]
+
+
+def test_a_scene_s_root_is_joined_to_the_body_by_no_bone(service: Service):
+    parents = (-1, *(parent + 1 for parent in BODY21.parents))
+    skeleton = Skeleton(name="scene", joints=("joint_Root", *BODY21.joints), parents=parents)
+    path = np.concatenate([np.zeros((60, 1, 3)), walking(60)], axis=1)
+    motion = Motion(name="walk", skeleton=skeleton, positions=path, fps=30.0)
+    answer = orjson.loads(sent(service, bvh(motion)).content)
+    joints, drawn = answer["skeleton"]["joints"], answer["parents"]
+    assert [joint for joint, parent in zip(joints, drawn, strict=True) if parent < 0] == [
+        "joint_Root",
+        "hips",
+    ]
+    assert answer["skeleton"]["parents"][joints.index("hips")] == joints.index("joint_Root")
 
 
 def test_part_of_a_fast_file_is_cut_and_slowed(service: Service):

@@ -7,6 +7,7 @@ from in_memory import Service
 from tiny_bundles import walking
 
 from models.motion.axes import Axes
+from models.motion.joint_tables import REQUIRED
 from models.motion.skeleton import BODY21, SENT_ORDERS, SKELETONS, joint_map
 from models.motion.standards import STANDARDS
 
@@ -156,6 +157,15 @@ def test_joints_never_seen_are_named(service: Service):
     found = [found["sentence"] for found in answer["findings"]]
     assert any("derived from others: hips." in sentence for sentence in found)
     assert any("guessed: left_hand." in sentence for sentence in found)
+
+
+@pytest.mark.parametrize("lost", [it for it in BODY21.joints if it not in REQUIRED])
+def test_any_joint_but_those_of_legs_and_shoulders_may_never_be_seen(service: Service, lost: str):
+    poses = WALK.tolist()
+    for pose in poses:
+        pose[BODY21.index(lost)] = None
+    sources = validated(service, poses)["joint_sources"]
+    assert [source == "observed" for source in sources] == [it != lost for it in BODY21.joints]
 
 
 def test_too_short_is_told_and_the_rest_is_too(service: Service):

@@ -231,7 +231,7 @@ export type FileObservation = {
     /**
      * Parents
      *
-     * index of each joint's parent, -1 for the root
+     * the joint from which a bone comes to each, -1 where none does: to draw it by
      */
     parents: Array<number>;
     /**

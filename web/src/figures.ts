@@ -12,7 +12,7 @@ import {
   Vector2,
   Vector3,
 } from "three";
-import { headOf, type Skeleton } from "./skeleton";
+import { headOf, hipsOf, rootOf, shouldersOf, type Skeleton } from "./skeleton";
 
 const SPINDLE = spindle(10, 8);
 const BALL = new SphereGeometry(1, 14, 10);
@@ -48,13 +48,13 @@ export class Figures {
     this.options = { thickness: 1, shadow: false, renderOrder: 0, ...options };
   }
 
-  setSkeleton({ joints, parents }: Skeleton): void {
+  setSkeleton(skeleton: Skeleton): void {
+    const { joints, parents } = skeleton;
     this.bones = parents.flatMap((parent, joint) => (parent >= 0 ? [[joint, parent]] : []));
     const head = headOf(joints);
     this.head = head >= 0 ? { joint: head, from: parents[head] } : null;
-    this.torso = this.head && torsoOf(parents, this.head.from);
-    const jointed = new Set(this.bones.flat());
-    this.loose = parents.flatMap((_, joint) => (jointed.has(joint) ? [] : [joint]));
+    this.torso = torsoOf(skeleton, this.head?.from ?? -1);
+    this.loose = this.bones.length > 0 ? [] : parents.map((_, joint) => joint);
     this.capacity = 0;
   }
 
@@ -112,21 +112,21 @@ export class Figures {
     // Any axis across the bone: that of the world which it is least along.
     const across = new Vector3(0, 0, 1);
     if (Math.abs(along.z) > 0.9 * length) across.set(1, 0, 0);
-    this.addSpindle(pose, parent, along, across, [wide, wide], wide, color);
+    this.addSpindle(pointOf(pose, parent), along, across, [wide, wide], wide, color);
   }
 
   private addTorso(pose: Float32Array, torso: Torso, color: Color): void {
-    const along = between(pose, torso.from, torso.to);
+    const start = middle(pose, torso.from);
+    const along = middle(pose, torso.to).sub(start);
     const sideways = between(pose, ...torso.hips);
     if (!(along.length() > 1e-4) || !(sideways.length() > 1e-4)) return;
     const [wide, deep] = TORSO.map((share) => share * along.length() * this.options.thickness);
-    this.addSpindle(pose, torso.from, along, sideways, [wide, deep], deep, color);
+    this.addSpindle(start, along, sideways, [wide, deep], deep, color);
   }
 
-  /** A spindle from a joint along a vector, a little beyond both ends so that limbs join. */
+  /** A spindle from a point along a vector, a little beyond both ends so that limbs join. */
   private addSpindle(
-    pose: Float32Array,
-    from: number,
+    from: Vector3,
     along: Vector3,
     across: Vector3,
     [wide, deep]: number[],
@@ -138,7 +138,7 @@ export class Figures {
     const z = new Vector3().crossVectors(across, direction).normalize();
     const x = new Vector3().crossVectors(direction, z);
     const reach = along.length() + beyond;
-    const start = new Vector3(...pose.subarray(from * 3, from * 3 + 3)).addScaledVector(direction, -beyond / 2);
+    const start = from.clone().addScaledVector(direction, -beyond / 2);
     MATRIX.makeBasis(x.multiplyScalar(wide), direction.multiplyScalar(reach), z.multiplyScalar(deep));
     this.spindles.setMatrixAt(this.numSpindles, MATRIX.setPosition(start));
     this.spindles.setColorAt(this.numSpindles++, color);
@@ -150,7 +150,7 @@ export class Figures {
   }
 
   private addBall(pose: Float32Array, joint: number, beyond: Vector3, radius: number, color: Color): void {
-    const at = new Vector3(...pose.subarray(joint * 3, joint * 3 + 3)).add(beyond);
+    const at = pointOf(pose, joint).add(beyond);
     if (!this.balls || Number.isNaN(at.x)) return;
     const wide = radius * (0.75 + 0.25 * this.options.thickness);
     MATRIX.makeScale(wide, wide, wide * 1.15).setPosition(at);
@@ -161,22 +161,27 @@ export class Figures {
 
 interface Torso {
   hips: [number, number];
-  from: number;
-  to: number;
+  from: number[];
+  to: number[];
 }
 
-/** From the root to the neck, where the head has one, turned as the hips are: the root's other children. */
-function torsoOf(parents: number[], neck: number): Torso | null {
-  const spine = new Set<number>();
-  for (let joint = neck; joint >= 0; joint = parents[joint]) spine.add(joint);
-  const root = [...spine].pop() ?? neck;
-  const hips = parents.flatMap((parent, joint) => (parent === root && !spine.has(joint) ? [joint] : []));
-  return hips.length >= 2 && root !== neck ? { hips: [hips[0], hips[1]], from: root, to: neck } : null;
+/** From the root to the neck, else from between the hips to between the shoulders; turned as the hips are. */
+function torsoOf(skeleton: Skeleton, neck: number): Torso | null {
+  const [hips, root] = [hipsOf(skeleton.joints), rootOf(skeleton)];
+  if (!hips || neck === root) return null;
+  if (neck >= 0) return { hips, from: [root], to: [neck] };
+  const shoulders = shouldersOf(skeleton.joints);
+  return shoulders && { hips, from: hips, to: shoulders };
 }
 
-function between(pose: Float32Array, from: number, to: number): Vector3 {
-  const [a, b] = [from * 3, to * 3];
-  return new Vector3(pose[b] - pose[a], pose[b + 1] - pose[a + 1], pose[b + 2] - pose[a + 2]);
+const pointOf = (pose: Float32Array, joint: number) => new Vector3().fromArray(pose, joint * 3);
+
+const between = (pose: Float32Array, from: number, to: number) => pointOf(pose, to).sub(pointOf(pose, from));
+
+function middle(pose: Float32Array, joints: number[]): Vector3 {
+  const sum = new Vector3();
+  for (const joint of joints) sum.add(pointOf(pose, joint));
+  return sum.divideScalar(joints.length);
 }
 
 /** A limb of length 1 along +Y and of radius 1: full in the middle, round at its ends. */

@@ -5,7 +5,7 @@ import type { Skeleton } from "./skeleton";
 
 export type Point = [number, number, number];
 export type Poses = (Point | null)[][];
-export type Axes = { up: Up; units: Units };
+export type Axes = { up: Up; units: Units; handed?: "right" | "left" };
 type Up = "x" | "-x" | "y" | "-y" | "z" | "-z";
 type Units = "m" | "cm" | "mm";
 
@@ -48,7 +48,8 @@ export function metres(length: number, { units }: Axes): number {
 export function trackOf(poses: Poses, axes: Axes): Track {
   const joints = poses[0]?.length ?? 0;
   const data = new Float32Array(poses.length * joints * 3);
-  const rows = TO_Z_UP[axes.up];
+  const [ahead, left, up] = TO_Z_UP[axes.up];
+  const rows = [ahead, axes.handed === "left" ? left.map((part) => -part) : left, up];
   const scale = 1 / UNITS_PER_METRE[axes.units];
   let at = 0;
   for (const pose of poses) {

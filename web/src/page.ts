@@ -120,7 +120,7 @@ function sawFrame(found: Motion): void {
   motion = found;
   now = found.track.frames - 1;
   timeline.player.playing = false;
-  timeline.set({ fps: found.fps, frames: found.track.frames }, now, answer);
+  timeline.set(found, now, answer);
   timeline.player.time = timeline.nowSeconds + ahead;
   if (first) {
     tellWebcam();
@@ -140,7 +140,7 @@ async function load(source: () => Promise<Motion>): Promise<void> {
     motion = found;
     answer = null;
     now = firstNow(found);
-    timeline.set({ fps: found.fps, frames: found.track.frames }, now, null);
+    timeline.set(found, now, null);
     timeline.player.time = timeline.nowSeconds;
     view.setMotion(found, now);
     tellMotion(found);
@@ -190,7 +190,7 @@ function show(found: api.Answer, at: number): void {
   element("preview").hidden = true;
   modes.set(found);
   view.setAnswer(found, at);
-  timeline.set({ fps: motion.fps, frames: motion.track.frames }, now, found);
+  timeline.set(motion, now, found);
   tellAnswer(found);
   showLook();
 }
@@ -239,7 +239,7 @@ function setNow(frame: number): void {
   if (!motion || webcam) return;
   const ahead = timeline.player.time - timeline.nowSeconds;
   now = timeline.bounded(frame);
-  timeline.set({ fps: motion.fps, frames: motion.track.frames }, now, answer);
+  timeline.set(motion, now, answer);
   timeline.player.time = timeline.nowSeconds + ahead;
   view.setNow(now);
   redraw();

@@ -3,7 +3,6 @@
 export class Player {
   time = 0;
   playing = false;
-  speed = 1;
   private from = 0;
   private to = 1;
   private rested = 0;
@@ -18,7 +17,7 @@ export class Player {
   tick(seconds: number): boolean {
     if (!this.playing) return false;
     if (this.time < this.to) {
-      this.time = Math.min(this.time + seconds * this.speed, this.to);
+      this.time = Math.min(this.time + seconds, this.to);
       this.rested = 0;
     } else if ((this.rested += seconds) > 0.8) {
       this.time = this.from;

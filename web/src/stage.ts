@@ -3,6 +3,7 @@
 import {
   DirectionalLight,
   HemisphereLight,
+  MathUtils,
   Mesh,
   NeutralToneMapping,
   Object3D,
@@ -22,6 +23,7 @@ Object3D.DEFAULT_UP.set(0, 0, 1);
 
 const REACH_M = 60; // of the ground, from the person
 const CALM_S = 0.35; // in which the camera catches up with the person
+const LEFT_M = 4; // across a square view, beyond which what lies behind is left
 
 export class Stage {
   readonly scene = new Scene();
@@ -32,7 +34,8 @@ export class Stage {
   private readonly sky = new HemisphereLight(0xffffff, 0x888888, 1.6);
   private readonly grid: Mesh<PlaneGeometry, ShaderMaterial>;
   private readonly shadow: Mesh<PlaneGeometry, ShadowMaterial>;
-  private readonly follow = new Vector3();
+  private readonly wanted = { at: new Vector3(), far: 1 };
+  private far = 1; // times the distance that was chosen, so that all is in view
   private changed = true;
   private drawn = 0;
 
@@ -104,7 +107,8 @@ export class Stage {
   lookAt(at: Vector3, ground: number, heading: number): void {
     this.grid.position.z = ground;
     this.shadow.position.z = ground + 0.002;
-    this.follow.copy(at);
+    this.follow(at, at);
+    this.far = this.wanted.far;
     this.controls.target.copy(at);
     const azimuth = heading + 0.95;
     const portrait = this.camera.aspect < 1 ? 1.25 : 1;
@@ -118,9 +122,13 @@ export class Stage {
     this.invalidate();
   }
 
-  /** Keep what is shown in view: the camera goes along with it. */
-  followTo(at: Vector3): void {
-    if (Number.isFinite(at.x + at.y + at.z)) this.follow.copy(at);
+  /** Keep a place in view, and `behind`, where what is there came from, until that is too far away. */
+  follow(place: Vector3, behind: Vector3): void {
+    const apart = place.distanceTo(behind) / this.camera.aspect;
+    if (!Number.isFinite(apart)) return;
+    const share = MathUtils.clamp(apart / LEFT_M - 0.5, 0.5, 1);
+    this.wanted.at.lerpVectors(behind, place, share);
+    this.wanted.far = Math.max(1, (1 - share) * apart);
   }
 
   orbit(azimuth: number, closer: number): void {
@@ -131,13 +139,17 @@ export class Stage {
   }
 
   private catchUp(seconds: number): boolean {
-    const left = this.follow.clone().sub(this.controls.target);
+    const left = this.wanted.at.clone().sub(this.controls.target);
     left.z = 0;
-    const step = left.multiplyScalar(1 - Math.exp(-seconds / CALM_S));
-    const moves = step.length() > 1e-4;
+    const share = 1 - Math.exp(-seconds / CALM_S);
+    const step = left.multiplyScalar(share);
+    const back = (this.wanted.far - this.far) * share;
+    const moves = step.length() > 1e-4 || Math.abs(back) > 1e-4;
     if (moves) {
+      const away = this.camera.position.sub(this.controls.target).multiplyScalar(1 + back / this.far);
+      this.far += back;
       this.controls.target.add(step);
-      this.camera.position.add(step);
+      away.add(this.controls.target);
     }
     const { x, y } = this.controls.target;
     for (const plane of [this.grid, this.shadow]) [plane.position.x, plane.position.y] = [x, y];

@@ -2,7 +2,9 @@
 
 import type { Answer } from "./api";
 import { colour, element, input } from "./dom";
+import type { Motion } from "./motion";
 import { Player } from "./player";
+import { rootOf } from "./skeleton";
 
 const THUMB_PX = 14; // as in style.css; a thumb's middle moves between half of it and the rest
 const NOW_ROW_PX = 20;
@@ -22,6 +24,7 @@ export class Timeline {
   private readonly clock = element<HTMLOutputElement>("clock");
   private fps = 30;
   private frames = 1;
+  private root = 0;
   private nowFrame = 0;
   private answer: Answer | null = null;
   private sample = 0;
@@ -51,9 +54,10 @@ export class Timeline {
     return Math.max(known, this.nowSeconds + longest / answer.fps);
   }
 
-  set(motion: { fps: number; frames: number }, now: number, answer: Answer | null): void {
+  set(motion: Motion, now: number, answer: Answer | null): void {
     this.fps = motion.fps;
-    this.frames = motion.frames;
+    this.frames = motion.track.frames;
+    this.root = rootOf(motion.skeleton);
     this.nowFrame = now;
     this.answer = answer;
     const ahead = answer ? Math.max(...answer.futures.map(({ frames }) => frames)) / answer.fps : 0;
@@ -139,7 +143,7 @@ export class Timeline {
       pen.moveTo(x(this.nowSeconds), top + box / 2);
       const outline: [number, number][] = [];
       for (let frame = 0; frame < centre.frames; frame++) {
-        const metres = radius[(level * centre.frames + frame) * centre.joints];
+        const metres = radius[(level * centre.frames + frame) * centre.joints + this.root];
         outline.push([x(this.nowSeconds + (frame + 1) / answer.fps), Math.min(metres, 1) * box * 0.5]);
       }
       for (const [at, tall] of outline) pen.lineTo(at, top + box / 2 - tall);

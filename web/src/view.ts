@@ -6,7 +6,7 @@ import { Figures } from "./figures";
 import { groundOf, type Motion, poseAt, type Track } from "./motion";
 import type { Palette } from "./palette";
 import { RegionBalls } from "./regions";
-import { hipsOf, watched } from "./skeleton";
+import { hipsOf, rootOf, watched } from "./skeleton";
 import type { Stage } from "./stage";
 import { type Trail, Trails } from "./trails";
 
@@ -77,7 +77,7 @@ export class View {
     this.motion = motion;
     this.answer = null;
     this.ground = groundOf(motion.track);
-    this.root = Math.max(0, motion.skeleton.parents.indexOf(-1));
+    this.root = rootOf(motion.skeleton);
     this.joints = watched(motion.skeleton).slice(0, MAX_WATCHED);
     this.pose = new Float32Array(motion.track.joints * 3);
     this.nowPose = new Float32Array(motion.track.joints * 3);
@@ -130,16 +130,17 @@ export class View {
 
     const since = seconds + (this.now - this.answered) / motion.fps;
     const ahead = answer && seconds > 0 ? since * answer.fps - 1 : null;
-    this.drawFutures(ahead, centre);
+    const there = this.drawFutures(ahead);
     this.drawTruth(seconds);
     if (ahead !== null && answer?.regions && this.look.regions) {
       this.regions.draw(answer.regions, this.joints, ahead);
     } else this.regions.hide();
-    this.stage.followTo(centre);
+    this.stage.follow(there ?? centre, centre);
     this.stage.invalidate();
   }
 
-  private drawFutures(ahead: number | null, centre: Vector3): void {
+  /** Where they are on average. */
+  private drawFutures(ahead: number | null): Vector3 | null {
     const { answer } = this;
     const { chosen, crowd } = ahead === null || !answer ? { chosen: [], crowd: [] } : this.shown();
     this.crowdMaterial.opacity = Math.min(0.5, 0.16 + 2 / Math.max(crowd.length, 1));
@@ -152,11 +153,12 @@ export class View {
         if (!track || ahead === null) continue;
         this.futurePose(track, ahead);
         figures.add(this.pose, this.colourOf(sample, ahead));
-        if (figures === this.chosen) mean.add(this.rootOf(this.pose));
+        mean.add(this.rootOf(this.pose));
       }
       figures.end();
     }
-    if (chosen.length > 0) centre.lerp(mean.divideScalar(chosen.length), 0.5); // both stay in view
+    const count = chosen.length + crowd.length;
+    return count > 0 ? mean.divideScalar(count) : null;
   }
 
   private drawTruth(seconds: number): void {
