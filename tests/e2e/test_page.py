@@ -24,7 +24,7 @@ from live import until
 from tiny_bundles import walking
 
 from models.motion.formats.bvh import write_bvh
-from models.motion.formats.files import read_motion
+from models.motion.formats.files import read_motion, write_motion
 from models.motion.motion import Motion
 from models.motion.skeleton import BODY21, Skeleton
 
@@ -190,10 +190,11 @@ def test_who_runs_away_stays_in_view(page):
     until(lambda: coloured(picture(page)) > 200, patience_s=PATIENCE_MS / 1000)
 
 
-def test_a_dropped_bvh_is_predicted_in_its_own_skeleton(page, tmp_path, complaints):
+@pytest.mark.parametrize("kind", ["bvh", "npz", "json"])
+def test_a_dropped_motion_is_predicted_in_its_own_skeleton(page, tmp_path, complaints, kind):
     motion = Motion(name="mine", skeleton=BODY21, positions=walking(90, fps=60.0), fps=60.0)
-    write_bvh(tmp_path / "mine.bvh", motion)
-    drop(page, tmp_path / "mine.bvh")
+    write_motion(tmp_path / f"mine.{kind}", motion)
+    drop(page, tmp_path / f"mine.{kind}")
     expect(page.locator("#motion-text")).to_contain_text("mine: 1.5 s")
     slide(page, "#seed", 23)
     page.locator('#timing[data-seed="23"]').wait_for()
@@ -226,12 +227,13 @@ def test_a_file_that_is_no_motion_is_refused_in_a_sentence(page, tmp_path):
 
 def drop(page: "sync_api.Page", file: Path) -> None:
     transfer = page.evaluate_handle(
-        """([name, text]) => {
+        """([name, content]) => {
+            const bytes = Uint8Array.from(atob(content), letter => letter.charCodeAt(0));
             const dropped = new DataTransfer();
-            dropped.items.add(new File([text], name));
+            dropped.items.add(new File([bytes], name));
             return dropped;
         }""",
-        [file.name, file.read_text()],
+        [file.name, base64.b64encode(file.read_bytes()).decode()],
     )
     page.dispatch_event("#stage", "drop", {"dataTransfer": transfer})
 
