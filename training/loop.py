@@ -48,6 +48,7 @@ class Run:
     network: nn.Module
     device: torch.device
     batches: BatchSource
+    seed: int
     progress: Progress
 
 
@@ -84,6 +85,7 @@ def train(
         network=recipe.build().to(device),
         device=device,
         batches=batches_of(store, recipe.data, seed=seed),
+        seed=seed,
         progress=Progress(**state["progress"]) if state else Progress(),
     )
     if state:
@@ -181,7 +183,7 @@ def _run_stage(
     stream = run.batches.stream(first=run.progress.total_updates, size=stage.batch_size)
     for update in range(run.progress.update, stage.num_updates):
         # Seeded by its number, so that a resumed run draws what an uninterrupted one would.
-        generator.manual_seed(run.progress.total_updates)
+        generator.manual_seed((run.seed << 32) + run.progress.total_updates)
         _set_rates(optimiser, stage, update)
         losses = stage.loss(run.network, _on(run.device, next(stream)), generator)
         _learn(optimiser, learning, losses, stage)

@@ -107,6 +107,21 @@ def test_new_run_starts_from_the_weights_of_a_finished_one(store, recipe, tmp_pa
     assert np.array_equal(weights(after), weights(before))
 
 
+def test_seed_decides_the_noise_of_a_run_whatever_its_weights(store, recipe, tmp_path):
+    stage, draws = recipe.stages[0], []
+
+    def loss(network, batch, generator):
+        draws.append(float(torch.rand((), generator=generator)))
+        return stage.loss(network, batch, generator)
+
+    noted = dataclasses.replace(recipe, stages=(dataclasses.replace(stage, loss=loss),))
+    for i, seed in enumerate((1, 1, 2)):
+        train(noted, store, tmp_path / str(i), device=CPU, seed=seed)
+    first, again, other = np.split(np.array(draws), 3)
+    assert np.array_equal(first, again)
+    assert not np.isin(first, other).any()
+
+
 def test_diverged_loss_stops_the_run(store, recipe, tmp_path):
     stage = recipe.stages[0]
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
 from models.diffusion import Schedule, q_sample
+from models.losses import motion_distance
 from models.pose import root_counts
 from models.system import Batch, Losses
 from models.systems.skeletondiffusion.networks import Decoder, Denoiser, Encoder, PastNetwork
@@ -83,11 +84,6 @@ class SkeletonDiffusion(nn.Module):
         return mixed(self.eigenvectors, z)
 
 
-def _distance(difference: Float[Tensor, "*B H F"]) -> Float[Tensor, "*B"]:
-    """Distance of two motions, poses as vectors, mean over the frames (metres)."""
-    return (difference.square().sum(dim=-1) + 1e-8).sqrt().mean(dim=-1)
-
-
 def _length(progress: float, horizon: int, *, full_at: float, longest_at: float) -> tuple[int, int]:
     """The shortest and the longest motion to learn now, in ticks."""
     rising = 0.5 - 0.5 * math.cos(math.pi * min(1.0, progress / longest_at))
@@ -128,7 +124,7 @@ def autoencoder_loss(  # noqa: PLR0913 - the settings of the stage
     outputs = nn.functional.pad(outputs, (0, 0, 0, missing))
     frames = ticks * future.shape[1] // nodes.num_ticks
     difference = nodes.motion(outputs, start) - nodes.target(observation, future)
-    error = _distance(nodes.weigh(difference)[:, :frames]).mean()
+    error = motion_distance(nodes.weigh(difference)[:, :frames]).mean()
     return {"total": error, "latent deviation": z.detach().std()}
 
 
@@ -274,7 +270,7 @@ def denoiser_loss(  # noqa: PLR0913 - the symbols of the equation
     losses = {"total": latent, "latent": latent}
     if reconstruction_weight:
         motion = network.motion(x0, start)
-        reconstruction = _distance(network.nodes.weigh(motion - target) * counts).mean()
+        reconstruction = motion_distance(network.nodes.weigh(motion - target) * counts).mean()
         losses |= {
             "total": latent + reconstruction_weight * reconstruction,
             "reconstruction": reconstruction,
@@ -300,4 +296,4 @@ def _nearest(  # noqa: PLR0913 - the symbols of the equation
     starts = start.repeat_interleave(count, dim=1)
     motion = network.motion(x0, starts, every=JUDGED_EVERY).unflatten(0, (-1, count))
     wanted = target[:, JUDGED_EVERY - 1 :: JUDGED_EVERY]
-    return _distance(network.nodes.weigh(motion - wanted[:, None]) * counts).argmin(dim=1)
+    return motion_distance(network.nodes.weigh(motion - wanted[:, None]) * counts).argmin(dim=1)

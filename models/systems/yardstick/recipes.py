@@ -1,4 +1,4 @@
-"""Complete training runs of the plain network."""
+"""Complete training runs of the yardstick."""
 
 from functools import partial
 
@@ -7,8 +7,8 @@ import numpy as np
 from models.diffusion import isotropic
 from models.protocols import HELD_OUT, ONE_STYLE, TWO_SECONDS, mocap_data
 from models.system import Data, Recipe, Stage
-from models.systems.plain.graphs import graphs
-from models.systems.plain.networks import PlainNetwork, best_of_many_loss
+from models.systems.yardstick.graphs import graphs
+from models.systems.yardstick.networks import Yardstick, best_of_many_loss
 
 
 def mocap() -> Recipe:
@@ -42,16 +42,16 @@ def _recipe(
 ) -> Recipe:
     return Recipe(
         name=name,
-        system="plain",
+        system="yardstick",
         description="A feed-forward network with a vector of noise, best of 24.",
         data=data,
-        build=partial(PlainNetwork, data, noise=noise, hidden=hidden, bases=24),
+        build=partial(Yardstick, data, noise=noise, hidden=hidden, bases=24),
         graphs=graphs,
         schedule=isotropic(np.zeros(1)),
         x_t_shape=(noise,),
         stages=(
             Stage(
-                name="plain",
+                name="yardstick",
                 loss=partial(best_of_many_loss, num_candidates=24),
                 trains=("enter", "add_noise", "network"),
                 num_updates=num_updates,

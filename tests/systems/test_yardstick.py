@@ -1,14 +1,14 @@
-"""The plain network's own rules; what every system must pass is in test_systems.py."""
+"""The yardstick's own rules; what every system must pass is in test_systems.py."""
 
 import pytest
 import torch
 
-from models.systems.plain.networks import PlainNetwork, best_of_many_loss
-from models.systems.plain.recipes import tiny
+from models.systems.yardstick.networks import Yardstick, best_of_many_loss
+from models.systems.yardstick.recipes import tiny
 
 
 @pytest.fixture
-def network() -> PlainNetwork:
+def network() -> Yardstick:
     return tiny().build()
 
 

@@ -1,16 +1,16 @@
-"""The graphs of the plain network: its one step hands the noise on, the decoder does the work."""
+"""The graphs of the yardstick: its one step hands the noise on, the decoder does the work."""
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from models.system import Graph
-from models.systems.plain.networks import PlainNetwork
+from models.systems.yardstick.networks import Yardstick
 
 
 class Encoder(nn.Module):
     """The observation as the first layer has it, once for a request."""
 
-    def __init__(self, network: PlainNetwork) -> None:
+    def __init__(self, network: Yardstick) -> None:
         super().__init__()
         self.network = network
 
@@ -30,7 +30,7 @@ class Denoiser(nn.Module):
 class Decoder(nn.Module):
     """Noise and context to a future."""
 
-    def __init__(self, network: PlainNetwork) -> None:
+    def __init__(self, network: Yardstick) -> None:
         super().__init__()
         self.network = network
 
@@ -46,7 +46,7 @@ class Decoder(nn.Module):
         return representation.leave(observation, self.network.future(x0, context, last))
 
 
-def graphs(network: PlainNetwork) -> tuple[Graph, ...]:
+def graphs(network: Yardstick) -> tuple[Graph, ...]:
     """Encoder, denoiser and decoder of a trained network."""
     return (
         Graph(

@@ -1,10 +1,11 @@
-"""The plain network: an observation and a vector of noise in, a future out, in one pass."""
+"""The yardstick: a plain network from an observation and a vector of noise to a future."""
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from models.layers import MLP
+from models.losses import motion_distance
 from models.pose import WorldPoses, cosine_basis
 from models.system import Batch, Data, Losses
 
@@ -12,7 +13,7 @@ STEPS_COUNT = 10.0
 """Steps from frame to frame are centimetres; so much more puts them on a pose's scale."""
 
 
-class PlainNetwork(nn.Module):
+class Yardstick(nn.Module):
     """A feed-forward network from what was observed and noise to the future's cosine spectrum.
 
     Args:
@@ -53,9 +54,9 @@ class PlainNetwork(nn.Module):
 
 
 def best_of_many_loss(
-    network: PlainNetwork, batch: Batch, generator: Generator, *, num_candidates: int
+    network: Yardstick, batch: Batch, generator: Generator, *, num_candidates: int
 ) -> Losses:
-    """The distance of the nearest of several futures (Guzman-Rivera et al. 2012, eq. 5).
+    """The distance of the nearest of several futures (Guzman-Rivera et al. 2012).
 
     All are judged without gradients and in bfloat16; the nearest is run again.
     """
@@ -68,11 +69,6 @@ def best_of_many_loss(
     context = network.context(enter(batch["seen"], batch["seen"]))
     with torch.no_grad(), torch.autocast(device.type, dtype=torch.bfloat16):
         tried = network.future(noise, context[:, None], last[:, None])
-        nearest = _distance(tried - wanted[:, None]).argmin(dim=1)
+        nearest = motion_distance(tried - wanted[:, None]).argmin(dim=1)
     chosen = noise[torch.arange(rows, device=device), nearest]
-    return {"total": _distance(network.future(chosen, context, last) - wanted).mean()}
-
-
-def _distance(difference: Float[Tensor, "*B H F"]) -> Float[Tensor, "*B"]:
-    """Distance of two motions, poses as vectors, mean over the frames (metres)."""
-    return (difference.square().sum(dim=-1) + 1e-8).sqrt().mean(dim=-1)
+    return {"total": motion_distance(network.future(chosen, context, last) - wanted).mean()}
