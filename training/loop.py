@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
@@ -183,7 +184,7 @@ def _run_stage(
     stream = run.batches.stream(first=run.progress.total_updates, size=stage.batch_size)
     for update in range(run.progress.update, stage.num_updates):
         # Seeded by its number, so that a resumed run draws what an uninterrupted one would.
-        generator.manual_seed((run.seed << 32) + run.progress.total_updates)
+        generator.manual_seed(_seed_of(run.seed, run.progress.total_updates))
         _set_rates(optimiser, stage, update)
         losses = stage.loss(run.network, _on(run.device, next(stream)), generator)
         _learn(optimiser, learning, losses, stage)
@@ -204,6 +205,11 @@ def _run_stage(
     with torch.no_grad():
         for parameter, mean in zip(learning, averaged, strict=False):
             parameter.copy_(mean)
+
+
+def _seed_of(seed: int, update: int) -> int:
+    # torch's generator on the CPU looks at 32 bits alone.
+    return int(np.random.SeedSequence([seed, update]).generate_state(1)[0])
 
 
 def _only_these_learn(network: nn.Module, stage: Stage) -> list[nn.Parameter]:

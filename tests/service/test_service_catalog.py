@@ -26,7 +26,7 @@ from service.catalog import Catalog
 from service.engine.engine import Engine
 from service.errors import UnknownModelError
 from service.settings import Settings
-from service.worker import WRITERS, Worker
+from service.worker import EXPRESS, WRITERS, Worker
 
 CORES = len(os.sched_getaffinity(0))
 BODY = {"poses": walking(), "num_samples": 1}
@@ -203,7 +203,7 @@ def test_threads_that_compute_leave_the_cores_to_the_event_loop(bundles: Path):
         computing = [thread for thread in others if thread.name.startswith("engine-")]
         priorities = {os.getpriority(os.PRIO_PROCESS, t.native_id or 0) for t in computing}
         own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-    assert len(computing) == 2 * (2 + WRITERS)
+    assert len(computing) == 2 * (2 + WRITERS + EXPRESS)
     assert priorities == {own + 3}
 
 
