@@ -82,6 +82,13 @@ def relative_to_root(num_joints: int, *, root_weight: float) -> Float[Tensor, "F
     return per_axis(mixing)
 
 
+def posture_and_steps(features: Float[Tensor, "B L F"]) -> Float[Tensor, "B LF"]:
+    """The steps that led to the last pose, and that pose."""
+    # Steps from frame to frame are centimetres; ten times as much puts them on a pose's scale.
+    steps = (features[:, 1:] - features[:, :-1]) * 10
+    return torch.cat([steps.flatten(1), features[:, -1]], dim=1)
+
+
 def root_counts(feature: Float[Tensor, "F"], root_weight: float) -> Float[Tensor, "F"]:
     """What each feature of a frame like this counts: the first three, the root's, by weight."""
     counts = torch.ones_like(feature)

@@ -287,19 +287,17 @@ class Worker:
         """
         with self._changed:
             self._changed.wait_for(
-                lambda: (
-                    self._stopped
-                    or self._lacks_threads(pressing=False)
-                    or self._lacks_threads(pressing=True)
-                )
+                lambda: self._stopped or self._lacks_threads(self._num_computing)
             )
-            pressing = not self._lacks_threads(pressing=False)
+            pressing = self._num_computing >= self._shares
             self._num_computing += 1
             return None if self._stopped else pressing
 
-    def _lacks_threads(self, *, pressing: bool) -> bool:
-        waiting = self._engine.num_pressing_waiting if pressing else self._engine.num_waiting
-        return waiting > 0 and self._num_computing < self._shares + (EXPRESS if pressing else 0)
+    def _lacks_threads(self, num_computing: int) -> bool:
+        """Whether there are rows that one thread more may run, beside so many that compute."""
+        if num_computing < self._shares:
+            return self._engine.num_waiting > 0
+        return num_computing < self._shares + EXPRESS and self._engine.num_pressing_waiting > 0
 
     def _computed(self, *, pressing: bool) -> list[Event]:
         """What comes of a turn, which has been this thread's to compute."""
@@ -311,7 +309,7 @@ class Worker:
             with self._changed:
                 self._num_computing -= 1
                 # Who has nothing to write computes on: to wake another for that would be in vain.
-                if self._engine.num_waiting and self._num_computing + (not writes) < self._shares:
+                if self._lacks_threads(self._num_computing + (not writes)):
                     self._changed.notify_all()
         if self._observer is not None and turn.num_rows:
             self._observer.stepped(

@@ -21,7 +21,8 @@ from models.bundle import (
 )
 from models.diffusion import cosine_schedule
 from models.motion.kinematics import bone_lengths, fit_bone_lengths
-from models.motion.skeleton import BODY21
+from models.motion.motion import Motion
+from models.motion.skeleton import BODY21, Skeleton
 
 NUM_OBSERVED, HORIZON, NUM_JOINTS, FPS, NUM_STEPS = 15, 60, 21, 30.0, 10
 X_T_SHAPE = (4, 3)
@@ -294,3 +295,12 @@ def walking(num_frames: int = NUM_OBSERVED, *, fps: float = FPS, speed: float = 
         poses[:, joint, 0] += reach * depth * np.sin(2 * np.pi * times)
     lengths = bone_lengths(standing_pose(), BODY21.parents)
     return np.ascontiguousarray(fit_bone_lengths(poses, lengths, BODY21.parents))
+
+
+def walking_in_a_scene(num_frames: int, *, name: str, away_m: float = 0.0) -> Motion:
+    """The same person under a joint that stands at the origin, as animation files have it."""
+    parents = (-1, *(parent + 1 for parent in BODY21.parents))
+    skeleton = Skeleton(name="scene", joints=("joint_Root", *BODY21.joints), parents=parents)
+    body = walking(num_frames) + np.array([away_m, 0.0, 0.0])
+    positions = np.concatenate([np.zeros((num_frames, 1, 3)), body], axis=1)
+    return Motion(name=name, skeleton=skeleton, positions=positions, fps=FPS)

@@ -21,12 +21,12 @@ from browsing import (
     sync_api,
 )
 from live import until
-from tiny_bundles import walking
+from tiny_bundles import walking, walking_in_a_scene
 
 from models.motion.formats.bvh import write_bvh
 from models.motion.formats.files import read_motion, write_motion
 from models.motion.motion import Motion
-from models.motion.skeleton import BODY21, Skeleton
+from models.motion.skeleton import BODY21
 
 expect = sync_api.expect
 
@@ -204,11 +204,7 @@ def test_a_dropped_motion_is_predicted_in_its_own_skeleton(page, tmp_path, compl
 
 
 def test_what_is_drawn_of_a_scene_is_the_body_and_the_way_of_its_hips(page, tmp_path):
-    parents = (-1, *(parent + 1 for parent in BODY21.parents))
-    scene = Skeleton(name="scene", joints=("joint_Root", *BODY21.joints), parents=parents)
-    body = walking(90) + np.array([5.0, 0.0, 0.0])  # from the origin, where the scene's root is
-    poses = np.concatenate([np.zeros((90, 1, 3)), body], axis=1)
-    write_bvh(tmp_path / "far.bvh", Motion(name="far", skeleton=scene, positions=poses, fps=30.0))
+    write_bvh(tmp_path / "far.bvh", walking_in_a_scene(90, name="far", away_m=5.0))
     drop(page, tmp_path / "far.bvh")
     expect(page.locator("#motion-text")).to_contain_text("far: 3.0 s")
     page.locator('#timing[data-futures="20"]').wait_for()

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_memory import Service
-from tiny_bundles import walking
+from tiny_bundles import walking, walking_in_a_scene
 
 from models.motion.formats.bvh import write_bvh
 from models.motion.formats.npz import clip_of, write_archive
 from models.motion.motion import Motion
-from models.motion.skeleton import BODY21, Skeleton
+from models.motion.skeleton import BODY21
 from service.media import MSGPACK, decoded
 
 SAMPLES = Path(__file__).parents[3] / "shared/data/samples"
@@ -52,10 +52,7 @@ def test_file_comes_back_as_what_predict_takes(service: Service):
 
 
 def test_a_scene_s_root_is_joined_to_the_body_by_no_bone(service: Service):
-    parents = (-1, *(parent + 1 for parent in BODY21.parents))
-    skeleton = Skeleton(name="scene", joints=("joint_Root", *BODY21.joints), parents=parents)
-    path = np.concatenate([np.zeros((60, 1, 3)), walking(60)], axis=1)
-    motion = Motion(name="walk", skeleton=skeleton, positions=path, fps=30.0)
+    motion = walking_in_a_scene(60, name="walk")
     answer = orjson.loads(sent(service, bvh(motion)).content)
     joints, drawn = answer["skeleton"]["joints"], answer["parents"]
     assert [joint for joint, parent in zip(joints, drawn, strict=True) if parent < 0] == [

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from models.continuation import Continuation
 from models.layers import MLP, Affine
-from models.pose import cosine_basis
+from models.pose import cosine_basis, posture_and_steps
 from models.system import Batch
 
 LOG_VARIANCE_LIMIT = 10.0
@@ -45,7 +45,7 @@ class SpectralBehaviourEncoder(nn.Module):
     ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
         """Mean and log variance of the behaviour's posterior."""
         spectrum = self.continuation.spectrum(target, future)
-        seen = torch.cat([_posture_and_steps(target), spectrum], dim=1)
+        seen = torch.cat([posture_and_steps(target), spectrum], dim=1)
         mean, log_variance = self.network(seen).chunk(2, dim=1)
         log_variance = (log_variance - 8.0).clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
         return mean + self.principal(spectrum), log_variance
@@ -73,7 +73,7 @@ class SpectralCoupler(nn.Module):
 
     def encode_target(self, target: Float[Tensor, "B C F"]) -> Float[Tensor, "B G"]:
         """g(x_m)."""
-        code: Tensor = self.target_encoder(_posture_and_steps(target))
+        code: Tensor = self.target_encoder(posture_and_steps(target))
         return code
 
     def offsets(
@@ -92,12 +92,6 @@ class SpectralCoupler(nn.Module):
     ) -> Float[Tensor, "B H F"]:
         """The future frame by frame."""
         return self.continuation.frames(offsets, expected)
-
-
-def _posture_and_steps(target: Float[Tensor, "B C F"]) -> Float[Tensor, "B CF"]:
-    # Steps from frame to frame are centimetres; ten times as much puts them on a pose's scale.
-    steps = (target[:, 1:] - target[:, :-1]) * 10
-    return torch.cat([steps.flatten(1), target[:, -1]], dim=1)
 
 
 @torch.no_grad()

@@ -232,14 +232,7 @@ def mocap_everything() -> Recipe:
 
 def mocap_one_style() -> Recipe:
     """`mocap` in one long run without one style, two subjects and four actions: is measured."""
-    schedule = _with_hips(falling)
-    return _recipe(
-        "mocap_one_style",
-        mocap_data(hold_out=ONE_STYLE),
-        Sizes(),
-        schedule,
-        stages=(_autoencoder_stage(4_000), _denoiser_stage(7_000, schedule)),
-    )
+    return _in_one_run("mocap_one_style", mocap_data(hold_out=ONE_STYLE), num_updates=7_000)
 
 
 def mocap_short() -> Recipe:
@@ -283,14 +276,13 @@ def mocap_positions_isotropic() -> Recipe:
 
 def mocap() -> Recipe:
     """Ours: 30 fps, half a second to two seconds, world trajectory, on public motion capture."""
+    return _in_one_run("mocap", mocap_data(), num_updates=5_000)
+
+
+def _in_one_run(name: str, data: Data, *, num_updates: int) -> Recipe:
     schedule = _with_hips(falling)
-    return _recipe(
-        "mocap",
-        mocap_data(),
-        Sizes(),
-        schedule,
-        stages=(_autoencoder_stage(4_000), _denoiser_stage(5_000, schedule)),
-    )
+    stages = (_autoencoder_stage(4_000), _denoiser_stage(num_updates, schedule))
+    return _recipe(name, data, Sizes(), schedule, stages=stages)
 
 
 def tiny() -> Recipe:

@@ -6,11 +6,8 @@ from torch import Generator, Tensor, nn
 
 from models.layers import MLP
 from models.losses import motion_distance
-from models.pose import WorldPoses, cosine_basis
+from models.pose import WorldPoses, cosine_basis, posture_and_steps
 from models.system import Batch, Data, Losses
-
-STEPS_COUNT = 10.0
-"""Steps from frame to frame are centimetres; so much more puts them on a pose's scale."""
 
 
 class Yardstick(nn.Module):
@@ -37,8 +34,7 @@ class Yardstick(nn.Module):
 
     def context(self, observed: Float[Tensor, "B T F"]) -> Float[Tensor, "B D"]:
         """What the first layer makes of the last pose and the steps that led to it."""
-        steps = (observed[:, 1:] - observed[:, :-1]) * STEPS_COUNT
-        context: Tensor = self.enter(torch.cat([steps.flatten(1), observed[:, -1]], dim=1))
+        context: Tensor = self.enter(posture_and_steps(observed))
         return context
 
     def future(
