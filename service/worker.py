@@ -3,7 +3,7 @@
 import asyncio
 import logging
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -82,7 +82,9 @@ class _Job:
     written_s: float = 0.0
     answered: Future[bytes] = field(default_factory=Future)
     shown: deque[bytes] = field(default_factory=deque)
-    steps_shown: int = 0
+    unwritten: dict[int, Event] = field(default_factory=dict)
+    num_written: int = 0
+    has_writer: bool = False
     news: Callable[[], None] = lambda: None
 
 
@@ -274,7 +276,8 @@ class Worker:
     def _drive(self) -> None:
         while (pressing := self._pressing_or_not()) is not None:
             try:
-                self._write(self._computed(pressing=pressing))
+                for event in self._computed(pressing=pressing):
+                    self._write(event)
             except Exception:  # noqa: BLE001 - the outermost loop: the thread must live
                 # Nobody can say whose fault it was, so everything under way fails.
                 _log.exception("the engine failed")
@@ -317,12 +320,33 @@ class Worker:
             )
         return turn.events
 
-    def _write(self, events: Sequence[Event]) -> None:
-        for event in events:
-            if isinstance(event, Preview):
-                self._show(event)
+    def _write(self, event: Event) -> None:
+        """Write what is told of a request, in order, whichever thread has what comes first.
+
+        Who finds another at it leaves its own to the other.
+        """
+        with self._changed:
+            job = self._jobs.get(event.request_id)
+            if job is None:
+                return
+            job.unwritten[event.order] = event
+            if job.has_writer:
+                return
+            job.has_writer = True
+        while (following := self._next_of(job)) is not None:
+            if isinstance(following, Preview):
+                self._show(following)
             else:
-                self._end(event)
+                self._end(following)
+
+    def _next_of(self, job: _Job) -> Event | None:
+        with self._changed:
+            event = job.unwritten.pop(job.num_written, None)
+            if event is None:
+                job.has_writer = False
+            else:
+                job.num_written += 1
+            return event
 
     def _show(self, preview: Preview) -> None:
         with self._changed:
@@ -338,11 +362,9 @@ class Worker:
             self._end(Failure(request_id=preview.request_id, error=_unforeseen()))
             return
         with self._changed:
-            if preview.steps_run > job.steps_shown:  # another thread may have been faster
-                job.steps_shown = preview.steps_run
-                job.shown.append(body)
-                while len(job.shown) > 1 and sum(map(len, job.shown)) > MAX_UNREAD_BYTES:
-                    job.shown.popleft()
+            job.shown.append(body)
+            while len(job.shown) > 1 and sum(map(len, job.shown)) > MAX_UNREAD_BYTES:
+                job.shown.popleft()
         job.news()
 
     def _end(self, ended: Result | Failure) -> None:

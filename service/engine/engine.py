@@ -169,7 +169,7 @@ class Engine:
             dispatch_s=dispatch_s,
             events=[
                 *failures,
-                *(job.preview(step, some) for job, step, some in shown),
+                *(job.preview(*some) for job, some in shown),
                 *(job.result() for job in ended),
             ],
         )
@@ -295,7 +295,7 @@ class Engine:
 
     def _settled(
         self, taken: Sequence[Trajectory], advanced: Sequence[Trajectory | Samples]
-    ) -> tuple[list[Job], list[tuple[Job, int, list[Shown]]]]:
+    ) -> tuple[list[Job], list[tuple[Job, tuple[int, int, list[Shown]]]]]:
         """The requests that a turn has ended, and the previews that it has made whole."""
         following: list[Trajectory] = []
         for some in advanced:
@@ -308,7 +308,7 @@ class Engine:
                 following.append(some)
         self._scheduler.settle(taken, following)
         touched = [self._jobs[i] for i in {s.request_id for s in advanced} & self._jobs.keys()]
-        shown = [(job, step, some) for job in touched for step, some in job.ready()]
+        shown = [(job, some) for job in touched for some in job.ready()]
         ended = [self._forget(job.request_id) for job in touched if job.finished]
         return ended, shown
 
@@ -317,8 +317,13 @@ class Engine:
         return self._jobs.pop(request_id)
 
     def _failure(self, request_id: int, error: ServiceError) -> Failure:
-        queued_s = self._forget(request_id).queued_s(self._clock())
-        return Failure(request_id=request_id, error=error, queued_s=queued_s)
+        job = self._forget(request_id)
+        return Failure(
+            request_id=request_id,
+            error=error,
+            queued_s=job.queued_s(self._clock()),
+            order=job.order(),
+        )
 
 
 def predict(engine: Engine, request: Request) -> Result:

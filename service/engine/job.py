@@ -35,6 +35,7 @@ class Job:
     samples: list[Samples] = field(default_factory=list)
     num_whole: int = 0
     previews: dict[int, list[Shown]] = field(default_factory=dict)
+    num_told: int = 0
 
     @property
     def finished(self) -> bool:
@@ -51,13 +52,15 @@ class Job:
         for shown in rows.shown:
             self.previews.setdefault(shown.steps_run, []).append(shown)
 
-    def ready(self) -> list[tuple[int, list[Shown]]]:
+    def ready(self) -> list[tuple[int, int, list[Shown]]]:
         """Steps that every row has behind it, or needs no more, and the futures of all then.
+
+        Before each, its place in all that is told of the request.
 
         The row that ends last may be one of few steps, for which previews of the others have
         waited; the last step's is the result.
         """
-        found: list[tuple[int, list[Shown]]] = []
+        found: list[tuple[int, int, list[Shown]]] = []
         last = max(samples.steps_run for samples in self.samples) if self.finished else inf
         for step in sorted(step for step in self.previews if step < last):
             whole = [
@@ -74,15 +77,20 @@ class Job:
             # A sample that was cut was shown at its last step, and is whole too.
             if len({int(i) for some in shown for i in some.sample_indices}) < self.num_rows:
                 break
-            found.append((step, shown))
+            found.append((self.order(), step, shown))
             del self.previews[step]
         return found
+
+    def order(self) -> int:
+        """The place of what is told next; what comes first has the lowest."""
+        self.num_told += 1
+        return self.num_told - 1
 
     def queued_s(self, now_s: float) -> float:
         """Seconds before its first turn, so far."""
         return (now_s if self.started_s is None else self.started_s) - self.added_s
 
-    def preview(self, steps_run: int, shown: Sequence[Shown]) -> Preview:
+    def preview(self, order: int, steps_run: int, shown: Sequence[Shown]) -> Preview:
         """The futures of all samples after so many steps."""
         num_frames = self._num_frames(shown)
         return Preview(
@@ -93,10 +101,11 @@ class Job:
             steps_run=steps_run,
             steps_of=self.steps_of,
             segments=self._segments(shown),
+            order=order,
         )
 
     def result(self) -> Result:
-        """What the samples make, which are all whole."""
+        """What the samples make, which are all whole; nothing is told after it."""
         reasons: set[StoppedBy] = {part.stopped_by for part in self.samples}
         return Result(
             request_id=self.request_id,
@@ -106,6 +115,7 @@ class Job:
             stopped_by=next(reason for reason in _BY_WEIGHT if reason in reasons),
             segments=self._segments(self.samples),
             queued_s=self.queued_s(self.added_s),
+            order=self.order(),
         )
 
     def _num_frames(self, parts: Sequence[Shown | Samples]) -> int:

@@ -63,6 +63,7 @@ class Result:
     frame, and the end of a sample's last segment is its length. Otherwise H is the horizon that was
     asked for, or less where the deadline came before the last leg. ``steps_run`` are the most that
     one row ran, of ``steps_of``, over all legs or actions; ``queued_s`` passed before the first.
+    ``order`` is the place of a result, a preview or a failure in all that is told of its request.
     """
 
     request_id: int
@@ -72,6 +73,7 @@ class Result:
     stopped_by: StoppedBy = "end"
     segments: tuple[tuple[Segment, ...], ...] = ()
     queued_s: float = 0.0
+    order: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -87,6 +89,7 @@ class Preview:
     steps_run: int
     steps_of: int
     segments: tuple[tuple[Segment, ...], ...] = ()
+    order: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -96,6 +99,7 @@ class Failure:
     request_id: int
     error: ServiceError
     queued_s: float = 0.0
+    order: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
