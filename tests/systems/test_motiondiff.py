@@ -11,7 +11,7 @@ from models.pose import cosine_basis
 from models.system import describe
 from models.systems.motiondiff import objective, recipes
 from models.systems.motiondiff.keyframes import Keyframes
-from models.systems.motiondiff.refiner import GraphConvolution, Refiner, layer_norm
+from models.systems.motiondiff.refiner import GraphConvolution, Refiner, SpreadRefiner
 
 FORMS = {"keyframes": recipes.tiny, "paper": recipes.tiny_paper}
 
@@ -90,7 +90,8 @@ def test_keyframes_of_a_motion_give_it_back_and_nothing_jumps():
     still = motion.leave(observation, torch.zeros_like(x0))
     assert torch.allclose(still, motion.continuation.expected(observation[:, -3:]), atol=1e-6)
     # What remains is no smaller along any other offset that the basis can tell.
-    assert torch.allclose(motion.continued(future - told), torch.zeros_like(future), atol=1e-4)
+    remains = torch.matmul(motion.continuation.basis.T, future - told)
+    assert torch.allclose(remains, torch.zeros_like(remains), atol=1e-4)
 
 
 def test_direction_that_varies_most_has_the_deviation_two():
@@ -121,26 +122,81 @@ def test_graph_convolution_is_the_product_of_its_paper():
     assert layer(nodes).flatten().tolist() == pytest.approx([43.5, 130.5, 129.5])
 
 
-def refiner(**options):
+SIZES = {"features": 6, "num_observed": 5, "horizon": 7, "hidden": 8, "blocks": 2}
+REFINERS = {
+    "paper": lambda: Refiner(**SIZES, coefficients=12),
+    "spread": lambda: SpreadRefiner(**SIZES, coefficients=6),
+}
+
+
+@pytest.fixture(params=REFINERS.values(), ids=REFINERS)
+def refiner(request):
     torch.manual_seed(1)  # noqa: TID251 - a test may fix the weights it makes
-    sizes = {"features": 6, "num_observed": 5, "horizon": 7, "coefficients": 12, "hidden": 8}
-    return Refiner(**sizes, blocks=2, norm=layer_norm, dropout=0.0, **options)
+    return request.param()
 
 
-def test_refiner_learns_which_coordinates_move_one_another():
-    network = refiner()
-    with torch.no_grad():
-        network.last.weight.normal_()
-    observation, future = torch.randn(2, 5, 6), torch.randn(2, 7, 6)
-    network(observation, future).square().sum().backward()
-    convolutions = [part for part in network.modules() if isinstance(part, GraphConvolution)]
-    assert len(convolutions) == 6
+def motions(rows, refiner):
+    """An observation, a future, and what is expected where a refinement looks at it."""
+    generator = torch.Generator().manual_seed(5)
+    frames = (5, 7, 7) if refiner.conditions else (5, 7)
+    return tuple(torch.randn(rows, count, 6, generator=generator) for count in frames)
+
+
+def with_weights(refiner):
+    for part in refiner.modules():
+        if isinstance(part, GraphConvolution) and not part.weight.any():
+            torch.nn.init.normal_(part.weight)
+    return refiner.eval()
+
+
+def test_refiner_learns_which_coordinates_move_one_another(refiner):
+    with_weights(refiner)(*motions(2, refiner)).square().sum().backward()
+    convolutions = [part for part in refiner.modules() if isinstance(part, GraphConvolution)]
+    assert len(convolutions) == {"Refiner": 6, "SpreadRefiner": 8}[type(refiner).__name__]
     assert all(float(part.adjacency.grad.abs().sum()) > 0 for part in convolutions)
 
 
-def test_refiner_starts_by_changing_nothing():
-    network = refiner()
-    assert torch.equal(network(torch.randn(2, 5, 6), torch.randn(2, 7, 6)), torch.zeros(2, 7, 6))
+def test_refiner_starts_by_changing_nothing(refiner):
+    assert torch.equal(refiner(*motions(2, refiner)), torch.zeros(2, 7, 6))
+
+
+@torch.no_grad()
+def test_what_is_expected_is_refined_by_what_the_noise_asks_for_alone():
+    refiner = with_weights(REFINERS["spread"]())
+    observation, future, expected = motions(2, refiner)
+    mended = refiner(observation, expected, expected)
+    assert float(mended.abs().max()) > 0.1
+    still = observation[:, -1:].expand_as(observation)  # whose spectrum is zero
+    assert torch.equal(refiner(still, expected, expected), torch.zeros_like(future))
+    moved = refiner(still, future, expected)
+    assert float(moved.abs().max()) > 0.1
+    deviation = torch.matmul(refiner.basis.T, future - expected)
+    grown = torch.matmul(refiner.basis.T, future + moved - expected)
+    ratio = grown / deviation
+    assert float(ratio.min()) >= 0
+    assert float(ratio.max()) <= 2
+
+
+@torch.no_grad()
+def test_units_of_the_spread_are_those_of_real_deviations():
+    refiner = REFINERS["spread"]()
+    observation, future, expected = motions(400, refiner)
+    refiner.fit(observation, 3 * future, 3 * expected)
+    deviation = torch.matmul(refiner.basis.T, 3 * (future - expected))
+    assert torch.allclose(refiner.scale, deviation.std(dim=0).T, atol=1e-5)
+
+
+@torch.no_grad()
+def test_expectation_is_the_x0_of_a_last_timestep_that_says_nothing():
+    network = network_of(recipes.tiny())
+    conditions = network.conditions(seen_by(network, recipes.tiny(), 3))
+    (found,) = network.expectation(conditions)
+    nothing = torch.zeros(3, *recipes.tiny().x_t_shape)
+    wanted = network.x0(nothing, torch.full((3,), 99), conditions)
+    assert torch.allclose(found, wanted.float(), atol=1e-5)
+    assert float(found.std()) > 0.01
+    paper = network_of(recipes.tiny_paper())
+    assert paper.expectation(paper.conditions(seen_by(paper, recipes.tiny_paper(), 2))) == ()
 
 
 def test_only_the_nearest_sample_is_reconstructed():
@@ -167,7 +223,10 @@ def test_stage_without_refinement_is_the_diffusion_as_it_is():
     network = network_of(recipes.tiny())
     graphs = {refines: bare.graphs.func(network, refines=refines) for refines in (True, False)}
     x0, seen = torch.randn(2, *recipes.tiny().x_t_shape), torch.randn(2, 15, 21, 3)
-    refined, plain = (graphs[refines][2].module(x0, seen) for refines in (True, False))
+    *conditions, expectation = graphs[True][0].module(seen)
+    assert len(conditions) == len(graphs[False][0].module(seen))
+    refined = graphs[True][2].module(x0, seen, expectation)
+    plain = graphs[False][2].module(x0, seen)
     features = network.representation.enter(seen, seen)
     expected = network.representation.leave(seen, network.motion.leave(features, x0))
     assert torch.allclose(plain, expected)

@@ -55,11 +55,6 @@ class Keyframes(nn.Module):
         expected = self.continuation.expected(observation[:, -self.num_target :])
         return self.continuation.frames(spectrum.flatten(1), expected)
 
-    def continued(self, offsets: Float[Tensor, "B H F"]) -> Float[Tensor, "B H F"]:
-        """The nearest offsets that grow from zero at the last observed frame."""
-        basis = self.continuation.basis
-        return torch.matmul(basis, torch.matmul(basis.T, offsets))
-
     @torch.no_grad()
     def fit(
         self,
@@ -226,6 +221,26 @@ class Denoiser(nn.Module):
         deviation = (alpha_bar * self.variance / total).sqrt()
         parts = condition + self.from_clock(self.clock[timestep])
         return known + deviation * self._rest(x_t / total.sqrt(), joints, parts)
+
+    def last_clock(self) -> Float[Tensor, "1 P"]:
+        """The last timestep's share of every scale and shift."""
+        result: Tensor = self.from_clock(self.clock[-1:])
+        return result
+
+    def expectation(
+        self,
+        condition: Float[Tensor, "B P"],
+        joints: Float[Tensor, "B J W"],
+        *,
+        clock: Float[Tensor, "1 P"],
+    ) -> Float[Tensor, "B M J 3"]:
+        """The x0 of an x_T that says nothing, with the clock of the last timestep."""
+        alpha_bar = self.alpha_bar[-1]
+        total = alpha_bar * self.variance + (1 - alpha_bar)
+        # Of so many rows; zeros would become a constant of the exported graph, of one row.
+        nothing = (0 * condition[:, :1])[:, :, None, None].expand(-1, *self.shape)
+        rest = self._rest(nothing, joints, condition + clock)
+        return -(self.variance * (1 - alpha_bar) / total).sqrt() * rest
 
     def _rest(
         self,

@@ -62,12 +62,27 @@ class MotionDiff(nn.Module):
         eps = self.denoiser(x_t, timestep, *conditions)
         return (x_t - (1 - alpha_bar).sqrt() * eps) / alpha_bar.sqrt()
 
+    def expectation(
+        self, conditions: tuple[Tensor, ...], clock: Tensor | None = None
+    ) -> tuple[Float[Tensor, "B M N 3"], ...]:
+        """The x0 of an x_T that says nothing, if the refinement looks at it.
+
+        ``clock``: the denoiser's ``last_clock``, where it is known already.
+        """
+        if not self.refiner.conditions:
+            return ()
+        clock = self.denoiser.last_clock() if clock is None else clock
+        return (self.denoiser.expectation(*conditions, clock=clock),)
+
     def refined(
-        self, observation: Float[Tensor, "B T F"], future: Float[Tensor, "B H F"]
+        self,
+        observation: Float[Tensor, "B T F"],
+        future: Float[Tensor, "B H F"],
+        *expectation: Float[Tensor, "B M N 3"],
     ) -> Float[Tensor, "B H F"]:
         """Z = Y + gamma eps_phi(Y, C)."""
-        displacement = self.motion.continued(self.refiner(observation, future))
-        return future + self.gamma * displacement
+        expected = (self.motion.leave(observation, x0) for x0 in expectation)
+        return future + self.gamma * self.refiner(observation, future, *expected)
 
 
 @torch.no_grad()
@@ -159,11 +174,14 @@ def sample(
     return motion.unflatten(0, (len(observation), num_samples))
 
 
+@torch.no_grad()
 def fit_refiner(network: MotionDiff, next_batch: Callable[[], Batch], *, num_batches: int) -> None:
     """Fit the units of the refinement's coefficients to some batches."""
     rows = [network.features(next_batch()) for _ in range(num_batches)]
     seen, _, future = (torch.cat(part) for part in zip(*rows, strict=True))
-    network.refiner.fit(seen, future)
+    network.eval()
+    (expectation,) = network.expectation(network.conditions(seen))
+    network.refiner.fit(seen, future, network.motion.leave(seen, expectation))
 
 
 def refinement_loss(  # noqa: PLR0913 - the symbols of Eq. 10
@@ -179,13 +197,17 @@ def refinement_loss(  # noqa: PLR0913 - the symbols of Eq. 10
     diversity_weight: float,
     exponent: float = 2.0,
     root_weight: float = 1.0,
+    root_diversity: float = 1.0,
 ) -> Losses:
     """Eq. 10: the best refined sample comes nearer, and the refined samples stay apart.
 
-    The first three features, the root's where a representation has it, count root_weight times.
+    The first three features, the root's where a representation has it, count root_weight times in
+    the former and root_diversity times in the latter.
     """
     seen, _, future = network.features(batch)
     network.denoiser.eval(), network.encoder.eval()
+    with torch.no_grad():
+        expectation = network.expectation(network.conditions(seen))
     with torch.autocast(seen.device.type, dtype=torch.bfloat16):
         samples = sample(
             network,
@@ -195,19 +217,19 @@ def refinement_loss(  # noqa: PLR0913 - the symbols of Eq. 10
             num_samples=num_samples,
             num_steps=num_steps,
         ).float()
-    refined = network.refined(
-        seen.repeat_interleave(num_samples, dim=0), samples.flatten(0, 1)
-    ).unflatten(0, samples.shape[:2])
-    counts = root_counts(future[0, 0], root_weight)
-    samples, refined, future = samples * counts, refined * counts, future * counts
-    reconstruction = best_of(refined, future, exponent=exponent)
-    diversity = closeness(refined, sigma=sigma)
+    rows = (part.repeat_interleave(num_samples, dim=0) for part in (seen, *expectation))
+    refined = network.refined(next(rows), samples.flatten(0, 1), *rows)
+    refined = refined.unflatten(0, samples.shape[:2])
+    near = root_counts(future[0, 0], root_weight)
+    apart = root_counts(future[0, 0], root_diversity)
+    reconstruction = best_of(near * refined, near * future, exponent=exponent)
+    diversity = closeness(apart * refined, sigma=sigma)
     return {
         "total": reconstruction_weight * reconstruction + diversity_weight * diversity,
         "reconstruction": reconstruction,
-        "unrefined": best_of(samples, future, exponent=exponent),
+        "unrefined": best_of(near * samples, near * future, exponent=exponent),
         "diversity": diversity,
-        "unrefined_diversity": closeness(samples, sigma=sigma),
+        "unrefined_diversity": closeness(apart * samples, sigma=sigma),
     }
 
 

@@ -37,10 +37,6 @@ class Frames(nn.Module):
         del observation
         return x0.flatten(2)
 
-    def continued(self, offsets: Float[Tensor, "B H F"]) -> Float[Tensor, "B H F"]:
-        """Offsets as they are."""
-        return offsets
-
 
 class SpatialTransformer(nn.Module):
     """S: the joints of each frame attend to one another; a frame becomes one vector.

@@ -13,11 +13,10 @@ from models.system import Data, Recipe, Stage, goes_on, stepwise
 from models.systems.motiondiff import keyframes, objective, paper
 from models.systems.motiondiff.graphs import graphs
 from models.systems.motiondiff.objective import MotionDiff
-from models.systems.motiondiff.refiner import Refiner, batch_norm, layer_norm
+from models.systems.motiondiff.refiner import Refiner, SpreadRefiner
 
 NUM_STEPS = 100
 STEPS = 10
-GAMMA = 0.1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,12 +31,11 @@ class Sizes:
     spatial_layers: int = 2
     temporal_width: int = 192
     temporal_layers: int = 4
-    coefficients: int = 32
     hidden: int = 64
-    blocks: int = 5
+    blocks: int = 2
 
 
-def build_keyframes(*, data: Data, sizes: Sizes, gamma: float) -> MotionDiff:
+def build_keyframes(*, data: Data, sizes: Sizes) -> MotionDiff:
     """Our form: keyframes of the world's motion, everything conditioned by scale and shift."""
     representation = WorldPoses(data.skeleton, root_weight=1.0)
     features = representation.num_features
@@ -67,17 +65,15 @@ def build_keyframes(*, data: Data, sizes: Sizes, gamma: float) -> MotionDiff:
             temporal_width=sizes.temporal_width,
             temporal_layers=sizes.temporal_layers,
         ),
-        refiner=Refiner(
+        refiner=SpreadRefiner(
             features=features,
             num_observed=data.num_observed,
             horizon=data.horizon,
-            coefficients=sizes.coefficients,
+            coefficients=sizes.num_frames,
             hidden=sizes.hidden,
             blocks=sizes.blocks,
-            norm=layer_norm,
-            dropout=0.0,
         ),
-        gamma=gamma,
+        gamma=1.0,
     )
 
 
@@ -127,8 +123,6 @@ def build_paper(*, data: Data, sizes: PaperSizes) -> MotionDiff:
             coefficients=sizes.coefficients,
             hidden=sizes.hidden,
             blocks=sizes.blocks,
-            norm=batch_norm,
-            dropout=0.5,
         ),
         gamma=0.01,
     )
@@ -137,7 +131,7 @@ def build_paper(*, data: Data, sizes: PaperSizes) -> MotionDiff:
 def mocap(
     *,
     hold_out: tuple[str, ...] = (),
-    updates: tuple[int, int] = (9_000, 600),
+    updates: tuple[int, int] = (9_000, 300),
 ) -> Recipe:
     """Ours: 30 fps, half a second to two seconds, world trajectory, on public motion capture."""
     data = mocap_data(hold_out=hold_out)
@@ -173,9 +167,7 @@ def mocap_without_spatial_transformer() -> Recipe:
     return dataclasses.replace(
         recipe,
         name="mocap_without_spatial_transformer",
-        build=partial(
-            build_keyframes, data=recipe.data, sizes=Sizes(spatial_layers=0), gamma=GAMMA
-        ),
+        build=partial(build_keyframes, data=recipe.data, sizes=Sizes(spatial_layers=0)),
     )
 
 
@@ -216,7 +208,6 @@ def tiny() -> Recipe:
         spatial_layers=1,
         temporal_width=16,
         temporal_layers=1,
-        coefficients=16,
         hidden=16,
         blocks=1,
     )
@@ -313,7 +304,7 @@ def _keyframe_recipe(
     sizes: Sizes,
     *,
     updates: tuple[int, int],
-    rows: tuple[int, int, int] = (64, 8, 20),
+    rows: tuple[int, int, int] = (64, 16, 25),
 ) -> Recipe:
     schedule = linear_schedule(NUM_STEPS)
     diffusion, refinement = updates
@@ -323,7 +314,7 @@ def _keyframe_recipe(
         system="motiondiff",
         description="Diffusion of motion, then refinement; half a second of 3D poses to two.",
         data=data,
-        build=partial(build_keyframes, data=data, sizes=sizes, gamma=GAMMA),
+        build=partial(build_keyframes, data=data, sizes=sizes),
         graphs=graphs,
         schedule=schedule,
         plan="stride",
@@ -357,7 +348,8 @@ def _keyframe_recipe(
                     reconstruction_weight=1.0,
                     diversity_weight=8.0,
                     exponent=1.0,
-                    root_weight=0.5,
+                    root_weight=0.7,
+                    root_diversity=0.0,
                 ),
                 trains=("refiner",),
                 num_updates=refinement,
