@@ -11,7 +11,7 @@ MEMORY = 0.9
 """The weight of what was known before, beside a call that was just seen."""
 TOWARDS_PROPORTIONAL = 0.01
 """How much calls of one size alone say of other sizes: that each row costs the same."""
-DEVIATIONS = 4.0
+DEVIATIONS = 7.0
 """So many mean deviations above the mean lies what hardly any call exceeds (as in RFC 6298)."""
 
 
@@ -77,11 +77,11 @@ class Costs:
             return math.fsum(seen.expected(rows) for seen, rows in self._known(calls))
 
     def at_most(self, **calls: int) -> float:
-        """Seconds that such calls hardly ever exceed together."""
+        """Seconds that such calls hardly ever exceed together; what delays one delays all."""
         with self._lock:
             known = list(self._known(calls))
             expected_s = math.fsum(seen.expected(rows) for seen, rows in known)
-            return expected_s + DEVIATIONS * math.hypot(*(seen.deviation_s for seen, _ in known))
+            return expected_s + DEVIATIONS * math.fsum(seen.deviation_s for seen, _ in known)
 
     def _known(self, calls: dict[str, int]) -> Iterator[tuple[_Seen, int]]:
         return ((self._seen[role], n) for role, n in calls.items() if n and role in self._seen)

@@ -53,6 +53,15 @@ def test_hardly_any_call_exceeds_the_most():
     assert costs.at_most(step=50) < 0.02
 
 
+def test_calls_are_late_together():
+    costs = Costs()
+    for some in (0.01, 0.02, 0.03, 0.01, 0.04):
+        costs.learn("step", 50, some)
+        costs.learn("answer", 50, 2 * some)
+    each = costs.at_most(step=50), costs.at_most(answer=50)
+    assert costs.at_most(step=50, answer=50) == pytest.approx(sum(each))
+
+
 def test_clock_is_read_around_a_call_and_not_where_it_fails():
     times = iter([1.0, 1.5, 2.0])
     costs = Costs(lambda: next(times))
