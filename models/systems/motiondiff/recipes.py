@@ -131,7 +131,7 @@ def build_paper(*, data: Data, sizes: PaperSizes) -> MotionDiff:
 def mocap(
     *,
     hold_out: tuple[str, ...] = (),
-    updates: tuple[int, int] = (9_000, 300),
+    updates: tuple[int, int] = (9_000, 400),
 ) -> Recipe:
     """Ours: 30 fps, half a second to two seconds, world trajectory, on public motion capture."""
     data = mocap_data(hold_out=hold_out)
@@ -344,9 +344,9 @@ def _keyframe_recipe(
                     schedule=schedule,
                     num_samples=samples,
                     num_steps=STEPS,
-                    sigma=10.0,
+                    sigma=20.0,
                     reconstruction_weight=1.0,
-                    diversity_weight=8.4,
+                    diversity_weight=10.0,
                     exponent=1.0,
                     root_weight=0.7,
                     root_diversity=0.0,
