@@ -309,8 +309,9 @@ def test_samples_that_were_cut_do_not_stand_for_those_of_another_thread():
     )
     assert job.ready() == []
     job.show(replace(shown, sample_indices=np.array([2, 3])))
-    ((step, parts),) = job.ready()
-    assert (step, job.preview(step, parts).segments) == (1, ((segment,),) * 4)
+    (shown_by_all,) = job.ready()
+    preview = job.preview(*shown_by_all)
+    assert (preview.steps_run, preview.segments) == (1, ((segment,),) * 4)
 
 
 def test_nan_fails_its_own_request_and_no_other(actions_bundle: Path):

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.layers import Affine
+from models.layers import Affine, in_lanes
 from models.pose import continuation_basis, cosine_basis
 
 STILL_M = 1e-3
@@ -120,6 +120,7 @@ class SpreadRefiner(nn.Module):
     basis: Tensor
     seen_basis: Tensor
     scale: Tensor
+    average: Tensor
 
     def __init__(
         self,
@@ -137,6 +138,8 @@ class SpreadRefiner(nn.Module):
         seen_basis = cosine_basis(num_observed, num_observed)
         self.register_buffer("seen_basis", seen_basis, persistent=False)
         self.register_buffer("scale", torch.ones(features, coefficients))
+        average = torch.full((1, features * NUM_FINE), 1 / (features * NUM_FINE))
+        self.register_buffer("average", average, persistent=False)
         self.seen = Affine(features * (num_observed + 1))
 
         def convolution(narrow: int, wide: int) -> GraphConvolution:
@@ -160,10 +163,12 @@ class SpreadRefiner(nn.Module):
     ) -> Float[Tensor, "B H F"]:
         """The displacement of every frame of the future, zero at the last observed one."""
         deviation = self._deviation(future, expected)
-        grown = deviation * torch.tanh(self.gate(deviation / self.scale))
+        grown = deviation * in_lanes(torch.tanh, self.gate(deviation / self.scale))
         seen = self._seen(observation)
         scaled = self.seen(seen.flatten(1)).clamp(-INPUT_LIMIT, INPUT_LIMIT).view_as(seen)
-        noise = seen[:, :, -NUM_FINE:].square().mean(dim=(1, 2)).sqrt()[:, None, None]
+        fine = seen[:, :, -NUM_FINE:].flatten(1)[:, :, None]
+        # A mean would round differently where there is one row.
+        noise = torch.matmul(self.average, fine.square()).sqrt()
         mended = noise / SENSOR_NOISE_M * self.mending(scaled) * self.scale
         return torch.matmul(self.basis, (grown + mended).transpose(1, 2))
 
