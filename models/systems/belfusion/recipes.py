@@ -6,7 +6,7 @@ from functools import partial
 from models.continuation import Continuation
 from models.diffusion import sqrt_schedule
 from models.pose import RootRelativePoses, WorldPoses
-from models.protocols import AMASS, H36M, HELD_OUT, TWO_SECONDS, mocap_data
+from models.protocols import AMASS, H36M, HELD_OUT, ONE_STYLE, TWO_SECONDS, mocap_data
 from models.system import Data, Recipe, Stage, goes_on, stepwise
 from models.systems.belfusion import objective, recurrent, spectral
 from models.systems.belfusion.dense_unet import DenseUNet
@@ -130,6 +130,11 @@ def mocap_held_out() -> Recipe:
 def mocap_longer() -> Recipe:
     """A finished `mocap_held_out` goes on: what is measured."""
     return goes_on("mocap_longer", mocap_held_out(), num_updates=8_000, learning_rate=8e-4)
+
+
+def mocap_one_style() -> Recipe:
+    """`mocap` without one style, two subjects and four actions: is measured too."""
+    return dataclasses.replace(mocap(hold_out=ONE_STYLE), name="mocap_one_style")
 
 
 def mocap_everything() -> Recipe:

@@ -8,7 +8,7 @@ import torch
 from models.diffusion import linear_schedule
 from models.motion.skeleton import HUMANEVA15
 from models.pose import RootRelativePoses, WorldPoses
-from models.protocols import H36M, HELD_OUT, TWO_SECONDS, mocap_data
+from models.protocols import H36M, HELD_OUT, ONE_STYLE, TWO_SECONDS, mocap_data
 from models.system import Data, Recipe, Stage, goes_on, stepwise
 from models.systems.motiondiff import keyframes, objective, paper
 from models.systems.motiondiff.graphs import graphs
@@ -159,6 +159,17 @@ def mocap_refinement_held_out() -> Recipe:
     """The last of several runs: a finished `mocap_diffusion_longer` gets its refinement."""
     recipe = mocap_held_out()
     return dataclasses.replace(recipe, name="mocap_refinement_held_out", stages=recipe.stages[1:])
+
+
+def mocap_one_style() -> Recipe:
+    """`mocap` in one long run without one style, two subjects and four actions: is measured."""
+    recipe = mocap(hold_out=ONE_STYLE, updates=(18_000, 400))
+    return dataclasses.replace(recipe, name="mocap_one_style")
+
+
+def mocap_diffusion_one_style() -> Recipe:
+    """`mocap_one_style` without refinement: its first stage, shown as it is."""
+    return _without_refinement(mocap_one_style(), name="mocap_diffusion_one_style")
 
 
 def mocap_without_spatial_transformer() -> Recipe:
@@ -348,7 +359,7 @@ def _keyframe_recipe(
                     reconstruction_weight=1.0,
                     diversity_weight=10.0,
                     exponent=1.0,
-                    root_weight=0.7,
+                    root_weight=1.5,
                     root_diversity=0.0,
                 ),
                 trains=("refiner",),
