@@ -12,7 +12,7 @@ MEMORY = 0.9
 TOWARDS_PROPORTIONAL = 0.01
 """How much calls of one size alone say of other sizes: that each row costs the same."""
 DEVIATIONS = 7.0
-"""So many mean deviations above the mean lies what hardly any call exceeds (as in RFC 6298)."""
+"""So many mean deviations above the mean lies what hardly any call exceeds (RFC 6298: four)."""
 
 
 @dataclass(kw_only=True, slots=True)

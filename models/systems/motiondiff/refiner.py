@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.layers import Affine, in_lanes
+from models.layers import Affine
 from models.pose import continuation_basis, cosine_basis
 
 STILL_M = 1e-3
@@ -163,11 +163,11 @@ class SpreadRefiner(nn.Module):
     ) -> Float[Tensor, "B H F"]:
         """The displacement of every frame of the future, zero at the last observed one."""
         deviation = self._deviation(future, expected)
-        grown = deviation * in_lanes(torch.tanh, self.gate(deviation / self.scale))
+        grown = deviation * torch.tanh(self.gate(deviation / self.scale))
         seen = self._seen(observation)
         scaled = self.seen(seen.flatten(1)).clamp(-INPUT_LIMIT, INPUT_LIMIT).view_as(seen)
         fine = seen[:, :, -NUM_FINE:].flatten(1)[:, :, None]
-        # A mean would round differently where there is one row.
+        # onnxruntime rounds the mean of a row by where in memory the row lies, a product never.
         noise = torch.matmul(self.average, fine.square()).sqrt()
         mended = noise / SENSOR_NOISE_M * self.mending(scaled) * self.scale
         return torch.matmul(self.basis, (grown + mended).transpose(1, 2))
